@@ -266,12 +266,14 @@ typedef struct bk_device_desc {
   /// this user only: files are checked, but charts that somebody else put there would be used.
   /// UTF-8; NULL: none are kept. Default: NULL.
   const char *cache_folder;
-  /// Folder for files that take the place of memory for the charts of light maps, where scenes are
-  /// larger than it (see bk_open_params.ray_queues): some 50 bytes per triangle, three times that
-  /// while a light map is created. The folder must exist; the files have no names in it, and
-  /// their room is free again when the light map is gone (64 MB of it: when the device is), however
-  /// the process ends. The library never writes more to them than there is room on the disk. UTF-8; NULL: all is in memory.
-  /// Default: NULL.
+  /// Folder for files that take the place of memory, where scenes are larger than it (see
+  /// bk_open_params.ray_queues): for copies of meshes, the acceleration structure (up to 250 bytes
+  /// per triangle while a scene is committed, up to 110 after it) and the charts of light maps
+  /// (some 50 bytes per triangle, three times that while a light map is created). The folder must
+  /// exist; the files have no names in it, and their room is free again when scene and light map
+  /// are gone (64 MB of it: when the device is), however the process ends. The library never
+  /// writes more to them than there is room on the disk. Arrays of less than 4 KB, textures and
+  /// texels are in memory as ever, and scenes from bk_scene_open in their file. UTF-8; NULL: all is in memory. Default: NULL.
   const char *scratch_folder;
 } bk_device_desc;
 
@@ -417,9 +419,13 @@ typedef struct bk_scene_stats {
   uint32_t refits;
   /// Duration of the last of these calls in seconds; 0 if there was none.
   double refit_seconds;
-  /// Number of `bytes` that are in a mapped scene file (bk_scene_open) instead of in memory, as far
-  /// as the system does not keep them there because it has room.
+  /// Number of `bytes` that are in a mapped scene file (bk_scene_open), or in files of
+  /// bk_device_desc.scratch_folder, instead of in memory, as far as the system does not keep them
+  /// there because it has room.
   uint64_t mapped_bytes;
+  /// Number of triangles, those of a mesh with instances counted once, whose trees
+  /// bk_scene_commit_from took over.
+  uint64_t kept_triangles;
 } bk_scene_stats;
 
 /// Creates an empty scene.
@@ -460,6 +466,10 @@ BK_API bk_result bk_scene_set_build(bk_scene *scene, const bk_build_params *para
 /// which spoils light from a distance of about a thousand times the scene's size on. A commit that
 /// fails or is cancelled leaves the description as it was.
 ///
+/// Where the device has a scratch_folder, the copies of meshes, the acceleration structure and, but
+/// for BK_BUILD_QUALITY_HIGH, the working memory of the build lie in files there; rays hit the
+/// same, bit for bit.
+///
 /// Cost: about 0.7 s per million triangles on one thread, 1.5 to 4 times that with
 /// BK_BUILD_QUALITY_HIGH; nearly half on two threads.
 ///
@@ -469,8 +479,39 @@ BK_API bk_result bk_scene_set_build(bk_scene *scene, const bk_build_params *para
 ///   another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the acceleration structure does not fit or the memory callback
 ///   refuses
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_API bk_result bk_scene_commit(bk_scene *scene, bk_progress_fn progress, void *user);
+
+/// Commits a scene as bk_scene_commit does, and takes over parts of the acceleration structure of
+/// an earlier scene, for massive scenes that are described anew after little has changed.
+///
+/// Each mesh with instances that is as it was, by its positions and indices, and had instances,
+/// keeps its tree, and so do all meshes without instances together, if they are the same in the
+/// same order. Where instances are, materials, lights and all else may have changed. Trees in which
+/// bk_scene_refit has moved a mesh are built anew, and all are if only one of the scenes has
+/// bk_build_params.compact. Other build parameters are those of the earlier trees. Rays hit the same
+/// as without, but for spatial splits in compact trees (see bk_build_params.compact).
+/// bk_scene_stats.kept_triangles says how much was taken over.
+///
+/// Cost: that of bk_scene_commit for meshes that have changed, a copy of the trees of the others.
+///
+/// @param scene  scene that is not committed
+/// @param earlier  committed scene, or one from a scene file, of any device; may be released after
+///   the call
+/// @param progress,user  progress callback and its pointer; may be NULL
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed already, `earlier` is not, the scene has no
+///   usable triangle, or another thread is changing it
+/// @retval BK_ERROR_OUT_OF_MEMORY  the acceleration structure does not fit or the memory callback
+///   refuses
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder, or the mapped file of
+///   `earlier` was changed
+/// @retval BK_ERROR_CANCELLED  the progress callback returned 0
+BK_API
+bk_result bk_scene_commit_from(bk_scene *scene,
+                               const bk_scene *earlier,
+                               bk_progress_fn progress,
+                               void *user);
 
 /// Applies the positions that bk_mesh_set_positions and the transforms that
 /// bk_instance_set_transform has set since the last refit; does nothing if there are none.
@@ -1004,6 +1045,7 @@ BK_API void bk_mesh_desc_init(bk_mesh_desc *desc);
 ///   BK_MESH_STRICT; bk_last_error names triangle and vertex
 /// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the copy does not fit or the memory callback refuses
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
 BK_API bk_result bk_scene_add_mesh(bk_scene *scene, const bk_mesh_desc *desc, uint32_t *out_id);
 
 /// Sets new positions for all vertices of a mesh of a committed scene. Nothing changes before

@@ -372,6 +372,11 @@ public:
     Result<void> commit(const Progress &progress = {}) {
         return detail::finish(progress.after(bk_scene_commit(get(), progress.function(), progress.user())));
     }
+    /// Takes over trees of meshes that are as they were in an earlier scene.
+    Result<void> commit_from(const Scene &earlier, const Progress &progress = {}) {
+        return detail::finish(
+            progress.after(bk_scene_commit_from(get(), earlier.get(), progress.function(), progress.user())));
+    }
     Result<void> save(const std::string &path, const Progress &progress = {}) const {
         return detail::finish(progress.after(bk_scene_save(get(), path.c_str(), progress.function(), progress.user())));
     }

@@ -5,7 +5,7 @@ use crate::base::callback;
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{MemoryFn, MemoryMonitor, try_zeroed_as_needed};
 use crate::base::progress::Progress;
-use crate::base::scratch_files::ScratchFiles;
+use crate::base::scratch_files::{ScratchFiles, Storage};
 use crate::base::threads::{self, Threads, Work};
 use crate::simd::{Isa, LIMIT_VARIABLE};
 use bytemuck::Pod;
@@ -32,9 +32,6 @@ pub type LogFn = dyn Fn(LogLevel, &str) + Send + Sync;
 /// limits of operating systems.
 pub const MAX_THREADS: usize = 1024;
 
-/// Size in bytes of the smallest array that is worth a place in a scratch file.
-const LEAST_IN_SCRATCH: usize = 1 << 12;
-
 /// Environment variable that shows log messages on standard error, see [`DeviceOptions::log`].
 const LOG_VARIABLE: &str = "BAKELITE_LOG";
 
@@ -54,8 +51,9 @@ pub struct DeviceOptions {
     /// Folder in which unwraps are kept by their content, for the next light map and the next run; it is made if needed.
     /// `None`: none are kept.
     pub cache_folder: Option<PathBuf>,
-    /// Folder for files that take the place of memory for the charts of light maps, where scenes are larger than it. The
-    /// files have no names, and are gone with the light map. `None`: all is in memory.
+    /// Folder for files that take the place of memory, where scenes are larger than it: for meshes, trees and what is needed
+    /// to build them but for spatial splits, and the charts of light maps. The files have no names, and are gone with what
+    /// lies in them. `None`: all is in memory.
     pub scratch_folder: Option<PathBuf>,
 }
 
@@ -214,10 +212,9 @@ impl Device {
     /// Makes an array of zeros that may be large: in a scratch file, if there is a folder for them. `what`: its name in error
     /// messages.
     pub(crate) fn zeroed<T: Pod>(&self, len: usize, what: &str) -> Result<Array<T>> {
-        match &self.scratch {
-            Some(files) if len * size_of::<T>() >= LEAST_IN_SCRATCH => files.zeroed(len),
-            _ => try_zeroed_as_needed(len, what).map(Array::from),
-        }
+        let array = self.storage().zeroed(len, try_zeroed_as_needed, what)?;
+        array.at_random();
+        Ok(array)
     }
 
     /// Copies the elements of a slice to an array that may be large, as [`zeroed`](Self::zeroed) makes it.
@@ -225,6 +222,17 @@ impl Device {
         let mut array = self.zeroed(values.len(), what)?;
         array.copy_from_slice(values);
         Ok(array)
+    }
+
+    /// Where arrays that may be large lie.
+    pub(crate) fn storage(&self) -> Storage<'_> {
+        Storage::new(self.scratch.as_ref())
+    }
+
+    /// Files for large arrays that are needed for a while, apart from those of others, so that their room is free when they
+    /// are gone; `None` if there is no folder for them.
+    pub(crate) fn files_for_work(&self) -> Option<ScratchFiles> {
+        self.scratch.as_ref().map(ScratchFiles::another)
     }
 
     /// Whether arrays that may be large lie in scratch files.

@@ -166,6 +166,84 @@ static void an_opened_scene_is_the_saved_one(void) {
     bk_device_release(device);
 }
 
+static unsigned char *read_all(const char *path, long *size) {
+    unsigned char *bytes;
+    FILE *file = fopen(path, "rb");
+    if (file == NULL) return NULL;
+    fseek(file, 0, SEEK_END);
+    *size = ftell(file);
+    rewind(file);
+    bytes = (unsigned char *)malloc((size_t)*size);
+    CHECK(fread(bytes, 1, (size_t)*size, file) == (size_t)*size);
+    fclose(file);
+    return bytes;
+}
+
+/* With a scratch folder, meshes and trees lie in files there, and are those of memory, bit for bit. */
+static void trees_in_scratch_files(void) {
+    bk_device *devices[2];
+    char name[2][600];
+    unsigned char *files[2];
+    long size[2] = {0, 0};
+    bk_hit hits[2][RAYS];
+    int i;
+    devices[0] = device_with(NULL);
+    devices[1] = device_with(folder_name);
+    for (i = 0; i < 2; i++) {
+        bk_scene *scene = described_scene(devices[i]);
+        bk_scene_stats stats;
+        CHECK_OK(bk_scene_load_builtin(scene, "hall:20000"));
+        CHECK_ERROR(bk_scene_commit(scene, never, NULL), BK_ERROR_CANCELLED, "");
+        CHECK_OK(bk_scene_commit(scene, NULL, NULL));
+        bk_scene_stats_init(&stats);
+        CHECK_OK(bk_scene_get_stats(scene, &stats));
+        CHECK((stats.mapped_bytes > stats.bytes / 2) == (i == 1) && stats.mapped_bytes < stats.bytes);
+        CHECK(stats.kept_triangles == 0);
+        trace(scene, hits[i]);
+        snprintf(name[i], sizeof name[i], "%s.%d", file_name, i);
+        CHECK_OK(bk_scene_save(scene, name[i], NULL, NULL));
+        files[i] = read_all(name[i], &size[i]);
+        bk_scene_release(scene);
+        bk_device_release(devices[i]);
+    }
+    CHECK(memcmp(hits[0], hits[1], sizeof hits[0]) == 0);
+    CHECK(size[0] > 1000000 && size[0] == size[1] && memcmp(files[0], files[1], (size_t)size[0]) == 0);
+    free(files[0]);
+    free(files[1]);
+    remove(name[0]);
+    remove(name[1]);
+}
+
+/* A scene that is described again has the trees of a file. */
+static void trees_of_an_earlier_scene(void) {
+    bk_device *device = device_with_cache();
+    bk_scene *earlier = described_scene(device), *scene = described_scene(device), *file = NULL;
+    bk_scene_stats stats;
+    bk_hit hits[RAYS], again[RAYS];
+    CHECK_ERROR(bk_scene_commit_from(scene, earlier, NULL, NULL), STATE, "not committed");
+    CHECK_ERROR(bk_scene_commit_from(scene, scene, NULL, NULL), STATE, "not committed");
+    CHECK_ERROR(bk_scene_commit_from(NULL, earlier, NULL, NULL), ARGUMENT, "scene is NULL");
+    CHECK_ERROR(bk_scene_commit_from(scene, NULL, NULL, NULL), ARGUMENT, "earlier is NULL");
+    CHECK_OK(bk_scene_commit(earlier, NULL, NULL));
+    trace(earlier, hits);
+    CHECK_OK(bk_scene_save(earlier, file_name, NULL, NULL));
+    bk_scene_release(earlier);
+    CHECK_OK(bk_scene_create(device, &file));
+    CHECK_OK(bk_scene_open(file, file_name, NULL, NULL, NULL));
+    CHECK_ERROR(bk_scene_commit_from(scene, file, never, NULL), BK_ERROR_CANCELLED, "");
+    CHECK_OK(bk_scene_commit_from(scene, file, NULL, NULL));
+    CHECK_ERROR(bk_scene_commit_from(scene, file, NULL, NULL), STATE, "committed already");
+    bk_scene_release(file);
+    bk_scene_stats_init(&stats);
+    CHECK_OK(bk_scene_get_stats(scene, &stats));
+    /* Of three instances with 72 triangles one counts. */
+    CHECK(stats.kept_triangles > 72 && stats.kept_triangles == stats.triangles - 2 * 72);
+    trace(scene, again);
+    CHECK(memcmp(hits, again, sizeof hits) == 0);
+    bk_scene_release(scene);
+    bk_device_release(device);
+}
+
 static void what_is_refused(void) {
     bk_device *device = device_with_cache();
     bk_scene *scene = NULL;
@@ -218,6 +296,9 @@ int main(int argc, char **argv) {
     snprintf(file_name, sizeof file_name, "%sroom.bkscene", folder);
     snprintf(folder_name, sizeof folder_name, "%sunwraps", folder);
     an_opened_scene_is_the_saved_one();
+    /* (The folder was made for the cache.) */
+    trees_in_scratch_files();
+    trees_of_an_earlier_scene();
     what_is_refused();
     return check_report("scene_files");
 }

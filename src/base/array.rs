@@ -28,14 +28,33 @@ impl Mapping {
         Mapping { start, bytes: map.len(), map }
     }
 
-    /// Asks the system to read a part of the file now.
-    fn will_need(&self, offset: usize, bytes: usize) {
-        // (Without, pages come one by one, when they are touched.)
-        #[cfg(unix)]
-        let _ = self.map.advise_range(memmap2::Advice::WillNeed, offset, bytes);
-        #[cfg(not(unix))]
-        let _ = (&self.map, offset, bytes);
+    /// Tells the system that a page here and a page there will be used.
+    pub fn at_random(&self) {
+        // What rays hit lies here and there, and what the system reads around it drives out what is needed: a bake of 20
+        // million triangles in 1 GB of memory read 1.6 TB in 2,500 s, without 95 GB in 830 s.
+        self.advise(Use::AtRandom, 0, self.bytes);
     }
+
+    /// Tells the system how a part of the file is going to be used. (Nothing depends on it.)
+    fn advise(&self, of: Use, offset: usize, bytes: usize) {
+        #[cfg(unix)]
+        {
+            let advice = match of {
+                Use::Soon => memmap2::Advice::WillNeed,
+                Use::AtRandom => memmap2::Advice::Random,
+            };
+            let _ = self.map.advise_range(advice, offset, bytes);
+        }
+        #[cfg(not(unix))]
+        let _ = (&self.map, of, offset, bytes);
+    }
+}
+
+/// How memory is going to be used.
+#[derive(Clone, Copy)]
+enum Use {
+    Soon,
+    AtRandom,
 }
 
 /// A slice that owns its memory: all of an allocation, as a `Vec` without its methods to grow, or a part of a file that
@@ -69,12 +88,28 @@ impl<T> Array<T> {
         start.is_aligned().then(|| Array { start, len, owner: Owner::Mapping { map: map.clone() } })
     }
 
-    /// Asks the system to read these elements now, if they lie in a mapped file.
+    /// Asks the system to read these elements now, if they lie in a mapped file. (Else pages come one by one, when they are
+    /// touched.)
     pub(crate) fn will_need(&self, elements: Range<usize>) {
+        self.advise(Use::Soon, elements);
+    }
+
+    /// Tells the system, if the elements lie in a mapped file, that one will be read here and one there, so that what lies
+    /// around them is not worth reading.
+    pub(crate) fn at_random(&self) {
+        self.advise(Use::AtRandom, 0..self.len());
+    }
+
+    fn advise(&self, of: Use, elements: Range<usize>) {
         let Owner::Mapping { map } = &self.owner else { return };
         let elements = &self[elements];
         let offset = elements.as_ptr().addr() - map.start.addr().get();
-        map.will_need(offset, size_of_val(elements));
+        map.advise(of, offset, size_of_val(elements));
+    }
+
+    /// Whether the elements lie in a mapped file.
+    pub(crate) fn is_mapped(&self) -> bool {
+        matches!(self.owner, Owner::Mapping { .. })
     }
 
     /// Lends the elements as a `Vec`, to add some or to take some away. (Those of a mapped file are copied.)

@@ -3,8 +3,12 @@
 
 use super::array::{Array, Mapping};
 use super::error::{Error, Result};
+use super::memory::try_zeroed;
+use super::parallel::ParallelLoop;
+use super::progress::Progress;
 use bytemuck::Pod;
 use memmap2::MmapMut;
+use rayon::prelude::*;
 use std::fs::{File, OpenOptions};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -17,6 +21,60 @@ const LARGEST_IN_SHARED: usize = SHARED / 8;
 /// Arrays begin at multiples of this.
 const ALIGN: usize = 64;
 
+/// Size in bytes of the smallest array that is worth a place in a scratch file.
+pub(crate) const LEAST_IN_SCRATCH: usize = 1 << 12;
+
+/// Where arrays that may be large lie: in scratch files, if there is a folder for them, or in memory.
+#[derive(Clone, Copy)]
+pub(crate) struct Storage<'a>(Option<&'a ScratchFiles>);
+
+impl<'a> Storage<'a> {
+    pub const MEMORY: Storage<'static> = Storage(None);
+
+    pub fn new(files: Option<&'a ScratchFiles>) -> Self {
+        Storage(files)
+    }
+
+    /// Whether it is files.
+    pub fn is_files(self) -> bool {
+        self.0.is_some()
+    }
+
+    /// Makes an array of zeros; in memory by `make`, whose name for it in error messages is `what`.
+    pub fn zeroed<T: Pod>(self, len: usize, make: fn(usize, &str) -> Result<Vec<T>>, what: &str) -> Result<Array<T>> {
+        match self.0 {
+            Some(files) if len.saturating_mul(size_of::<T>()) >= LEAST_IN_SCRATCH => files.zeroed(len),
+            _ => make(len, what).map(Array::from),
+        }
+    }
+
+    /// Copies the elements of an array, on the current threads.
+    pub fn copy<T: Pod + Send + Sync>(self, values: &Array<T>, what: &str, progress: &Progress) -> Result<Array<T>> {
+        let mut copy = self.zeroed(values.len(), try_zeroed, what)?;
+        let part = (PART / size_of::<T>().max(1)).max(1);
+        let parts = copy.par_chunks_mut(part).zip(values.par_chunks(part)).enumerate();
+        parts.try_each(|(i, (to, from))| {
+            progress.check()?;
+            // (What was said to be read here and there would come page by page.)
+            values.will_need(i * part..i * part + from.len());
+            to.copy_from_slice(from);
+            Ok(())
+        })?;
+        Ok(copy)
+    }
+
+    /// Moves an array that is in memory to files, if these are the storage.
+    pub fn take_in<T: Pod + Send + Sync>(self, array: &mut Array<T>, progress: &Progress) -> Result<()> {
+        if self.is_files() && !array.is_mapped() && size_of_val(&array[..]) >= LEAST_IN_SCRATCH {
+            *array = self.copy(array, "", progress)?;
+        }
+        Ok(())
+    }
+}
+
+/// Size in bytes of what is copied between two looks for a cancel.
+const PART: usize = 4 << 20;
+
 /// Arrays in files of a folder.
 pub(crate) struct ScratchFiles {
     folder: PathBuf,
@@ -27,6 +85,11 @@ pub(crate) struct ScratchFiles {
 impl ScratchFiles {
     pub fn new(folder: PathBuf) -> ScratchFiles {
         ScratchFiles { folder, shared: Mutex::new(None) }
+    }
+
+    /// Arrays in other files of the same folder.
+    pub fn another(&self) -> ScratchFiles {
+        ScratchFiles::new(self.folder.clone())
     }
 
     /// Makes an array of zeros. A file goes when all arrays in it are gone, but the one that is being filled stays.
@@ -47,7 +110,12 @@ impl ScratchFiles {
         let mut shared = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
         let (map, used) = match shared.take() {
             Some((map, used)) if used + bytes <= SHARED => (map, used),
-            _ => (self.file(SHARED)?, 0),
+            _ => {
+                let map = self.file(SHARED)?;
+                // What of many small arrays is used next lies here and there.
+                map.at_random();
+                (map, 0)
+            }
         };
         *shared = Some((map.clone(), (used + bytes).next_multiple_of(ALIGN)));
         Ok((map, used))
@@ -60,12 +128,7 @@ impl ScratchFiles {
         });
         let fail =
             |e| Error::Io(format!("cannot make a scratch file of {bytes} bytes in {}: {e}", self.folder.display()));
-        let map = map.map_err(fail)?;
-        // What rays hit lies here and there, and what the system reads around it drives out what is needed: a bake of 20
-        // million triangles in 1 GB of memory read 1.6 TB in 2,500 s, without 95 GB in 830 s.
-        #[cfg(unix)]
-        let _ = map.advise(memmap2::Advice::Random);
-        Ok(Arc::new(Mapping::new(map)))
+        Ok(Arc::new(Mapping::new(map.map_err(fail)?)))
     }
 }
 

@@ -1,13 +1,14 @@
 //! The binary tree, before it is collapsed to wide nodes.
 
+use crate::base::array::Array;
 use crate::base::geometry::half_area;
 use crate::base::parallel::ParallelLoop;
-use bytemuck::Zeroable;
+use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use rayon::prelude::*;
 
 /// A node of the binary tree, 32 bytes. The left child of an inner node follows it.
-#[derive(Clone, Copy, Debug, Default, Zeroable)]
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
 #[repr(C)]
 pub struct BinaryNode {
     /// Lower corner of the node's box.
@@ -23,9 +24,9 @@ pub struct BinaryNode {
 /// The binary tree, before collapse.
 pub struct BinaryBvh {
     /// Node 0 is the root. Slots of subtrees that ended early are unused and zero.
-    pub nodes: Vec<BinaryNode>,
+    pub nodes: Array<BinaryNode>,
     /// Global triangle numbers, leaf by leaf.
-    pub triangles: Vec<u32>,
+    pub triangles: Array<u32>,
 }
 
 impl BinaryBvh {

@@ -3,7 +3,8 @@
 //!
 //! A subtree over n triangles owns a fixed range of 2n − 1 node slots and of n triangle slots, so threads never share
 //! any of them; what one thread builds lies at the beginning of its range, so that slots that are not needed take no
-//! memory. References move in place. Their order depends on how ranges are cut into blocks; but bins, boxes and
+//! memory. References move in place, so that scratch files can take the place of memory: ranges of references are read and
+//! written from one end to the other, and below some splits a range fits into memory. Their order depends on how ranges are cut into blocks; but bins, boxes and
 //! partings are the same in any order, and leaves are sorted, so the tree depends on the triangles alone.
 
 use super::BuildOptions;
@@ -16,6 +17,7 @@ use crate::base::error::Result;
 use crate::base::memory::{try_collect, try_filled, try_push, try_zeroed, try_zeroed_as_needed};
 use crate::base::parallel::ParallelLoop;
 use crate::base::progress::Progress;
+use crate::base::scratch_files::Storage;
 #[cfg(target_arch = "x86_64")]
 use crate::simd::Isa;
 use glam::{Vec3, Vec4};
@@ -375,15 +377,20 @@ impl BinaryBvh {
         options: &BuildOptions,
         progress: &Progress,
     ) -> Result<BinaryBvh> {
-        BinaryBvh::of(References::of(valid, corners)?, options, progress)
+        BinaryBvh::of(References::of(valid, corners)?, options, Storage::MEMORY, progress)
     }
 
-    /// Builds the tree over at least one reference.
-    pub(super) fn of(references: References, options: &BuildOptions, progress: &Progress) -> Result<BinaryBvh> {
+    /// Builds the tree over at least one reference. It lies in `storage`.
+    pub(super) fn of(
+        references: References,
+        options: &BuildOptions,
+        storage: Storage,
+        progress: &Progress,
+    ) -> Result<BinaryBvh> {
         let References { mut refs, extent, .. } = references;
         let n = refs.len();
-        let mut nodes = try_zeroed_as_needed::<BinaryNode>(2 * n - 1, TREE)?;
-        let mut triangles = try_zeroed::<u32>(n, TREE)?;
+        let mut nodes = storage.zeroed::<BinaryNode>(2 * n - 1, try_zeroed_as_needed, TREE)?;
+        let mut triangles = storage.zeroed::<u32>(n, try_zeroed, TREE)?;
         let mut slots = Slots { nodes: &mut nodes, base: 0, used: 0, triangles: &mut triangles, first: 0, filled: 0 };
         Builder { options, progress }.build(&mut refs, &mut slots, extent, 0, &mut Work::new())?;
         progress.check()?;

@@ -47,13 +47,13 @@ pub(super) fn set_box<const W: usize>(node: &mut Node<W>, i: usize, b: &Box4) {
 
 /// The binary nodes that become the children of a wide node.
 #[derive(Clone, Copy)]
-struct Plan<const W: usize> {
+pub(super) struct Plan<const W: usize> {
     children: [u32; W],
     count: u32,
     /// Index of the node of the first inner child, and slot of the first triangle of the first leaf; those of the
     /// others follow.
-    first_node: u32,
-    first_slot: u32,
+    pub(super) first_node: u32,
+    pub(super) first_slot: u32,
 }
 
 /// The plans of the nodes of a subtree, its root's first, and the indices of these plans in the order of their leaves.
@@ -114,17 +114,34 @@ fn plans_in_sequence<const W: usize>(binary: &BinaryBvh, source: Subtree, progre
     let n = source.triangles();
     let idle = Plan { children: [0; W], count: 0, first_node: 0, first_slot: 0 };
     let mut plans = try_with_capacity(n / 6 + 1, PLANS)?;
-    plans.push(idle);
     let mut order = try_with_capacity(n / 6 + 1, PLANS)?;
-    let mut slot = 0;
+    for_each_plan(binary, source, progress, |target, plan, count| {
+        while plans.len() < count {
+            try_push(&mut plans, idle, PLANS)?;
+        }
+        plans[target] = plan;
+        try_push(&mut order, target as u32, PLANS)
+    })?;
+    Ok(Plans { plans, order })
+}
+
+/// Calls `visit` with each node of a subtree, in the order of their leaves: its index, its plan, and the number of nodes
+/// whose index is known, its children's too. Returns the number of all.
+pub(super) fn for_each_plan<const W: usize>(
+    binary: &BinaryBvh,
+    source: Subtree,
+    progress: &Progress,
+    mut visit: impl FnMut(usize, Plan<W>, usize) -> Result<()>,
+) -> Result<usize> {
+    let (mut nodes, mut slot, mut visited) = (1, 0, 0);
     let mut work = vec![(0usize, source)];
     while let Some((target, source)) = work.pop() {
         let (subtrees, count) = open::<W>(binary, source);
         let children = subtrees.map(|s| s.node);
-        let first = plans.len();
-        plans[target] = Plan { children, count: count as u32, first_node: first as u32, first_slot: slot };
-        try_push(&mut order, target as u32, PLANS)?;
-        if order.len() % NODES_PER_JOB == 0 {
+        let first = nodes;
+        let plan = Plan { children, count: count as u32, first_node: first as u32, first_slot: slot };
+        visited += 1;
+        if visited % NODES_PER_JOB == 0 {
             progress.check()?;
         }
         for &child in &subtrees[..count] {
@@ -132,21 +149,22 @@ fn plans_in_sequence<const W: usize>(binary: &BinaryBvh, source: Subtree, progre
             match node.count {
                 0 => {
                     prefetch(&raw const binary.nodes[node.index as usize]);
-                    work.push((plans.len(), child));
-                    try_push(&mut plans, idle, PLANS)?;
+                    work.push((nodes, child));
+                    nodes += 1;
                 }
                 triangles => slot += triangles,
             }
         }
         // The first child's subtree is next.
         let end = work.len();
-        work[end - (plans.len() - first)..].reverse();
+        work[end - (nodes - first)..].reverse();
+        visit(target, plan, nodes)?;
     }
-    Ok(Plans { plans, order })
+    Ok(nodes)
 }
 
 const PLANS: &str = "the plan of the tree";
-const LEAVES: &str = "the leaves of the tree";
+pub(super) const LEAVES: &str = "the leaves of the tree";
 
 /// Collapses a binary tree to one of compact nodes and leaves; `meshes` as in [`Compact::new`].
 pub(super) fn collapse_compact(binary: &BinaryBvh, meshes: &[u32], progress: &Progress) -> Result<Compact> {
@@ -214,7 +232,7 @@ pub(super) fn collapse<const W: usize>(
 const NODES_PER_JOB: usize = 1024;
 
 /// Number of nodes whose leaves are filled together: some 200 triangles.
-const NODES_PER_BLOCK: usize = 32;
+pub(super) const NODES_PER_BLOCK: usize = 32;
 
 /// Number of plans ahead of which binary nodes are asked for.
 const AHEAD: usize = 4;
@@ -224,27 +242,27 @@ const AHEAD: usize = 4;
 /// reads of many triangles under way. (With nodes asked for ahead: Sponza's whole build 2.5 → 3.3 million triangles per
 /// second, San Miguel's alike.)
 #[derive(Default)]
-struct LeafBlock {
+pub(super) struct LeafBlock {
     /// Number of triangles of each leaf.
     counts: Vec<u32>,
-    triangles: Vec<u32>,
+    pub(super) triangles: Vec<u32>,
     corners: Vec<[Vec3; 3]>,
 }
 
 impl LeafBlock {
-    fn clear(&mut self) {
+    pub(super) fn clear(&mut self) {
         self.counts.clear();
         self.triangles.clear();
         self.corners.clear();
     }
 
-    fn add(&mut self, leaf: &BinaryNode, binary: &BinaryBvh) -> Result<()> {
+    pub(super) fn add(&mut self, leaf: &BinaryNode, binary: &BinaryBvh) -> Result<()> {
         try_push(&mut self.counts, leaf.count, LEAVES)?;
         try_append(&mut self.triangles, &binary.triangles[leaf.index as usize..][..leaf.count as usize], LEAVES)
     }
 
     /// Fills in the leaves, which follow each other.
-    fn fill(&mut self, mut rows: &mut [f32], corners: &impl Fn(u32) -> [Vec3; 3]) -> Result<()> {
+    pub(super) fn fill(&mut self, mut rows: &mut [f32], corners: &impl Fn(u32) -> [Vec3; 3]) -> Result<()> {
         let no_room = |e| Error::OutOfMemory(format!("{LEAVES}: {e}"));
         self.corners.try_reserve(self.triangles.len()).map_err(no_room)?;
         self.corners.extend(self.triangles.iter().map(|&t| corners(t)));
@@ -263,12 +281,12 @@ impl<const W: usize> Plan<W> {
         self.children[..self.count as usize].iter().for_each(|&c| prefetch(&raw const binary.nodes[c as usize]));
     }
 
-    fn leaves<'a>(&'a self, binary: &'a BinaryBvh) -> impl Iterator<Item = &'a BinaryNode> {
+    pub(super) fn leaves<'a>(&'a self, binary: &'a BinaryBvh) -> impl Iterator<Item = &'a BinaryNode> {
         self.children[..self.count as usize].iter().map(|&c| &binary.nodes[c as usize]).filter(|b| b.count > 0)
     }
 }
 
-fn node<const W: usize>(binary: &BinaryBvh, plan: &Plan<W>) -> Node<W> {
+pub(super) fn node<const W: usize>(binary: &BinaryBvh, plan: &Plan<W>) -> Node<W> {
     let mut node = Node::EMPTY;
     let (mut next_node, mut next_slot) = (plan.first_node as usize, plan.first_slot as usize);
     for (i, &child) in plan.children[..plan.count as usize].iter().enumerate() {
@@ -288,7 +306,7 @@ fn node<const W: usize>(binary: &BinaryBvh, plan: &Plan<W>) -> Node<W> {
 
 /// A node of the binary tree with all below it.
 #[derive(Clone, Copy)]
-struct Subtree {
+pub(super) struct Subtree {
     node: u32,
     /// Range of its triangles, which follow one another as its leaves do.
     first: u32,
@@ -298,7 +316,7 @@ struct Subtree {
 }
 
 impl Subtree {
-    fn root(binary: &BinaryBvh) -> Subtree {
+    pub(super) fn root(binary: &BinaryBvh) -> Subtree {
         Subtree::new(binary, 0, 0, binary.triangles.len() as u32)
     }
 

@@ -11,6 +11,8 @@ use crate::base::error::Result;
 use crate::base::geometry::half_area;
 use crate::base::memory::{try_collect, try_to_vec};
 use crate::base::parallel::ParallelLoop;
+use crate::base::progress::Progress;
+use crate::base::scratch_files::Storage;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -250,14 +252,13 @@ pub(crate) struct Compact {
 
 impl Compact {
     /// Copies the tree; fails if there is not enough memory.
-    pub(super) fn try_clone(&self) -> Result<Compact> {
+    pub(super) fn copy(&self, storage: Storage, progress: &Progress) -> Result<Compact> {
         let what = "a copy of the tree";
-        Ok(Compact {
-            nodes: try_to_vec(&self.nodes, what)?.into(),
-            triangles: try_to_vec(&self.triangles, what)?.into(),
-            bounds: self.bounds,
-            blocks: try_to_vec(&self.blocks, what)?,
-        })
+        let (nodes, triangles) =
+            (storage.copy(&self.nodes, what, progress)?, storage.copy(&self.triangles, what, progress)?);
+        nodes.at_random();
+        triangles.at_random();
+        Ok(Compact { nodes, triangles, bounds: self.bounds, blocks: try_to_vec(&self.blocks, what)? })
     }
 
     /// Makes a tree of its arrays; `meshes`: the first triangle of each mesh, and the number of all triangles at the end.

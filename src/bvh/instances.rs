@@ -8,6 +8,7 @@ use crate::base::error::Result;
 use crate::base::geometry::{MAX_COORDINATE, is_valid_triangle};
 use crate::base::memory::{try_collect, try_push, try_to_vec};
 use crate::base::progress::Progress;
+use crate::base::scratch_files::Storage;
 use glam::{Mat3A, Vec3, Vec3A};
 
 /// The trees of a scene's instances.
@@ -64,6 +65,8 @@ pub(crate) struct MeshTree {
     pub skipped: Vec<u32>,
     /// Number of the others that cannot be hit since a refit.
     pub gone: usize,
+    /// Whether a refit has moved its mesh: a tree built anew may be better, and have triangles that were none.
+    pub is_refitted: bool,
 }
 
 /// An instance as rays meet it.
@@ -136,22 +139,24 @@ impl Instances {
         trees + self.top.bytes() + size_of_val(&self.placed[..])
     }
 
-    /// Copies the trees; fails if there is not enough memory.
-    pub(crate) fn try_clone(&self) -> Result<Instances> {
+    /// Copies the trees, those of meshes to `storage`; fails if there is not enough memory.
+    pub(crate) fn copy(&self, storage: Storage) -> Result<Instances> {
+        let none = Progress::none();
         let what = "a copy of the trees of instances";
         let mut trees = Vec::new();
         for t in &self.trees {
             let copy = MeshTree {
                 mesh: t.mesh,
                 range: t.range,
-                tree: t.tree.try_clone()?,
+                tree: t.tree.copy(storage, &none)?,
                 skipped: try_to_vec(&t.skipped, what)?,
                 gone: t.gone,
+                is_refitted: t.is_refitted,
             };
             try_push(&mut trees, copy, what)?;
         }
         Ok(Instances {
-            top: self.top.try_clone()?,
+            top: self.top.copy(Storage::MEMORY, &none)?,
             trees,
             placed: try_to_vec(&self.placed, what)?,
             margin: self.margin,

@@ -3,8 +3,9 @@
 use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::geometry::half_area;
-use crate::base::memory::try_to_vec;
 use crate::base::parallel::ParallelLoop;
+use crate::base::progress::Progress;
+use crate::base::scratch_files::Storage;
 use crate::simd::prefetch;
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
@@ -196,6 +197,17 @@ pub struct Mbvh<const W: usize = WIDTH> {
     pub(crate) bounds: (Vec3, Vec3),
 }
 
+impl Mbvh {
+    /// Copies the tree; fails if there is not enough memory.
+    pub(super) fn copy(&self, storage: Storage, progress: &Progress) -> Result<Self> {
+        let what = "a copy of the tree";
+        let (nodes, leaves) = (storage.copy(&self.nodes, what, progress)?, storage.copy(&self.leaves, what, progress)?);
+        nodes.at_random();
+        leaves.at_random();
+        Ok(Mbvh { nodes, leaves, bounds: self.bounds })
+    }
+}
+
 impl<const W: usize> Mbvh<W> {
     /// Returns a tree of nothing, which no ray hits.
     pub(crate) fn nothing() -> Self {
@@ -206,16 +218,6 @@ impl<const W: usize> Mbvh<W> {
     #[inline]
     pub(crate) fn has_no_leaves(&self) -> bool {
         self.leaves.len() <= LEAF_PAD
-    }
-
-    /// Copies the tree; fails if there is not enough memory.
-    pub(super) fn try_clone(&self) -> Result<Self> {
-        let what = "a copy of the tree";
-        Ok(Mbvh {
-            nodes: try_to_vec(&self.nodes, what)?.into(),
-            leaves: try_to_vec(&self.leaves, what)?.into(),
-            bounds: self.bounds,
-        })
     }
 
     /// Lower and upper corner of the box around all triangles.

@@ -6,6 +6,7 @@ mod binned;
 mod bins;
 mod check;
 mod collapse;
+mod collapse_in_files;
 pub(crate) mod compact;
 mod compact_refit;
 mod cut;
@@ -25,8 +26,10 @@ pub use layout::{ChildRef, Mbvh, Node};
 pub(crate) use references::References;
 pub(crate) use refit::refit as refit_whole;
 
+use crate::base::array::Array;
 use crate::base::error::{Result, invalid_argument};
 use crate::base::progress::Progress;
+use crate::base::scratch_files::Storage;
 use glam::Vec3;
 
 /// Quality of the build, against its time.
@@ -159,6 +162,17 @@ impl Tree {
         }
     }
 
+    /// Size in bytes of what lies in files.
+    pub(crate) fn mapped_bytes(&self) -> usize {
+        fn size<T>(array: &Array<T>) -> usize {
+            if array.is_mapped() { size_of_val(&array[..]) } else { 0 }
+        }
+        match self {
+            Tree::Whole(t) => size(&t.nodes) + size(&t.leaves),
+            Tree::Compact(t) => size(&t.nodes) + size(&t.triangles),
+        }
+    }
+
     /// Cost as [`Mbvh::sah_cost`].
     pub(crate) fn sah_cost(&self) -> f32 {
         match self {
@@ -185,31 +199,54 @@ impl Tree {
     }
 
     /// Copies the tree; fails if there is not enough memory.
-    pub(crate) fn try_clone(&self) -> Result<Tree> {
+    pub(crate) fn copy(&self, storage: Storage, progress: &Progress) -> Result<Tree> {
         Ok(match self {
-            Tree::Whole(t) => Tree::Whole(t.try_clone()?),
-            Tree::Compact(t) => Tree::Compact(t.try_clone()?),
+            Tree::Whole(t) => Tree::Whole(t.copy(storage, progress)?),
+            Tree::Compact(t) => Tree::Compact(t.copy(storage, progress)?),
         })
+    }
+}
+
+/// Where a tree lies, and what is needed to build it: references and the binary tree.
+#[derive(Clone, Copy)]
+pub(crate) struct BuildStorage<'a> {
+    pub tree: Storage<'a>,
+    pub work: Storage<'a>,
+}
+
+impl<'a> BuildStorage<'a> {
+    /// In memory.
+    #[cfg(test)]
+    pub const MEMORY: BuildStorage<'static> = BuildStorage { tree: Storage::MEMORY, work: Storage::MEMORY };
+
+    /// In `tree` and `work`, but for spatial splits, which need memory to be tried.
+    pub fn new(tree: Storage<'a>, work: Storage<'a>, options: &BuildOptions) -> Self {
+        match options.quality {
+            BuildQuality::Default => BuildStorage { tree, work },
+            BuildQuality::High => BuildStorage { tree, work: Storage::MEMORY },
+        }
     }
 }
 
 /// Builds the tree over the triangles of at least one reference, with the `corners`. Returns it with its SAH cost: that
 /// of the binary tree with traversal and intersection costing 1 each.
 ///
-/// `meshes`: the first triangle of each mesh, and the number of all triangles at the end.
+/// `meshes`: the first triangle of each mesh, and the number of all triangles at the end. The bits are the same in any storage.
 pub(crate) fn build(
     corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
     references: References,
     meshes: &[u32],
     options: &BuildOptions,
+    BuildStorage { tree: storage, work }: BuildStorage,
     progress: &Progress,
 ) -> Result<(Tree, f32)> {
-    let binary = build_binary(corners, references, options, progress)?;
+    let binary = build_binary(corners, references, options, work, progress)?;
     let cost = binary.sah_cost();
-    let tree = if options.compact {
-        Tree::Compact(collapse::collapse_compact(&binary, meshes, progress)?)
-    } else {
-        Tree::Whole(collapse::collapse(&binary, corners, progress)?)
+    let tree = match (options.compact, storage.is_files()) {
+        (true, false) => Tree::Compact(collapse::collapse_compact(&binary, meshes, progress)?),
+        (false, false) => Tree::Whole(collapse::collapse(&binary, corners, progress)?),
+        (true, true) => Tree::Compact(collapse_in_files::collapse_compact(&binary, meshes, storage, progress)?),
+        (false, true) => Tree::Whole(collapse_in_files::collapse(&binary, corners, storage, progress)?),
     };
     Ok((tree, cost))
 }
@@ -222,7 +259,8 @@ pub(crate) fn build_four_wide(
     options: &BuildOptions,
     progress: &Progress,
 ) -> Result<Mbvh<4>> {
-    collapse::collapse(&build_binary(corners, references, options, progress)?, corners, progress)
+    let binary = build_binary(corners, references, options, Storage::MEMORY, progress)?;
+    collapse::collapse(&binary, corners, progress)
 }
 
 /// Builds the tree over the triangles `numbers`, which are few beside those of a scene. (Compiled once.)
@@ -235,7 +273,7 @@ fn build_few(
     if numbers.is_empty() {
         return Ok(Mbvh::nothing());
     }
-    let binary = build_binary(&corners, References::of(numbers, &corners)?, options, progress)?;
+    let binary = build_binary(&corners, References::of(numbers, &corners)?, options, Storage::MEMORY, progress)?;
     collapse::collapse(&binary, &corners, progress)
 }
 
@@ -243,11 +281,12 @@ fn build_binary(
     corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
     references: References,
     options: &BuildOptions,
+    storage: Storage,
     progress: &Progress,
 ) -> Result<BinaryBvh> {
     options.validate()?;
     let binary = match options.quality {
-        BuildQuality::Default => BinaryBvh::of(references, options, progress)?,
+        BuildQuality::Default => BinaryBvh::of(references, options, storage, progress)?,
         BuildQuality::High => {
             BinaryBvh::spatial_of(references, corners as &(dyn Fn(u32) -> [Vec3; 3] + Sync), options, progress)?
         }
@@ -303,7 +342,14 @@ mod tests {
             let options = BuildOptions { bins: 2, quality, ..Default::default() };
             pool.install(|| {
                 let (deepest, large) = depths(
-                    &build_binary(&of, References::of(&valid, &of).unwrap(), &options, &Progress::none()).unwrap(),
+                    &build_binary(
+                        &of,
+                        References::of(&valid, &of).unwrap(),
+                        &options,
+                        Storage::MEMORY,
+                        &Progress::none(),
+                    )
+                    .unwrap(),
                 );
                 assert!(
                     deepest > layout::SAH_DEPTH && large > 20,
@@ -312,8 +358,15 @@ mod tests {
                 for compact in [false, true] {
                     let options = BuildOptions { compact, ..options };
                     let meshes = [0, corners.len() as u32];
-                    let (mut tree, _) =
-                        build(&of, References::of(&valid, &of).unwrap(), &meshes, &options, &Progress::none()).unwrap();
+                    let (mut tree, _) = build(
+                        &of,
+                        References::of(&valid, &of).unwrap(),
+                        &meshes,
+                        &options,
+                        BuildStorage::MEMORY,
+                        &Progress::none(),
+                    )
+                    .unwrap();
                     let room = tree.room_to_refit().unwrap();
                     tree.refit(&|t| corners[t as usize], room);
                 }

@@ -1,10 +1,12 @@
 //! Boxes of four lanes, and the references to triangles that builders sort.
 
+use crate::base::array::Array;
 use crate::base::error::Result;
 use crate::base::geometry::half_area;
 use crate::base::memory::{try_par_collect_ok, try_push, try_with_capacity, try_zeroed};
 use crate::base::progress::Progress;
-use bytemuck::Zeroable;
+use crate::base::scratch_files::Storage;
+use bytemuck::{Pod, Zeroable};
 use glam::{Mat4, Vec3, Vec4, Vec4Swizzles};
 use rayon::prelude::*;
 
@@ -15,7 +17,7 @@ const REFERENCES: &str = "references to triangles";
 pub(super) const CHUNK: usize = 1 << 12;
 
 /// A box stored as its negated lower and its upper corner, so that one maximum of eight lanes joins two.
-#[derive(Clone, Copy, Zeroable)]
+#[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C, align(32))]
 pub(super) struct Box4 {
     pub(super) neg_lower: Vec4,
@@ -95,7 +97,7 @@ impl Range4 {
 
 /// The box of a triangle; its number is stored in `neg_lower.w` as the low bits of a normal float (arithmetic on
 /// denormals would be slow), which no result depends on.
-#[derive(Clone, Copy, Zeroable)]
+#[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(transparent)]
 pub(super) struct Reference(pub(super) Box4);
 
@@ -176,7 +178,7 @@ impl Extent {
 /// References to all triangles that a tree is built over, and their extent.
 pub(crate) struct References {
     /// In order of their numbers, on which trees with spatial splits depend.
-    pub(super) refs: Vec<Reference>,
+    pub(super) refs: Array<Reference>,
     pub(super) extent: Extent,
     /// The numbers of the triangles that are not valid, ascending.
     pub(crate) skipped: Vec<u32>,
@@ -191,32 +193,34 @@ struct Filled {
 }
 
 impl References {
-    /// References to the triangles with numbers below `count` whose corners are `valid`.
+    /// References to the triangles with numbers below `count` whose corners are `valid`. They lie in `storage`.
     pub(crate) fn of_valid(
         count: usize,
         corners: &(impl Fn(u32) -> [Vec3; 3] + Sync),
         valid: impl Fn([Vec3; 3]) -> bool + Sync,
+        storage: Storage,
         progress: &Progress,
     ) -> Result<References> {
         let reference = |i| {
             let corners = corners(i as u32);
             valid(corners).then(|| Reference::new(i as u32, corners))
         };
-        References::collect(count, reference, progress)
+        References::collect(count, reference, storage, progress)
     }
 
     /// References to some triangles by their numbers.
     pub(super) fn of(triangles: &[u32], corners: &(impl Fn(u32) -> [Vec3; 3] + Sync)) -> Result<References> {
         let reference = |i| Some(Reference::new(triangles[i], corners(triangles[i])));
-        References::collect(triangles.len(), reference, &Progress::none())
+        References::collect(triangles.len(), reference, Storage::MEMORY, &Progress::none())
     }
 
     fn collect(
         count: usize,
         reference: impl Fn(usize) -> Option<Reference> + Sync,
+        storage: Storage,
         progress: &Progress,
     ) -> Result<References> {
-        let mut refs = try_zeroed::<Reference>(count, REFERENCES)?;
+        let mut refs = storage.zeroed::<Reference>(count, try_zeroed, REFERENCES)?;
         let fill = |(i, chunk): (usize, &mut [Reference])| {
             let (mut n, mut skipped) = (0, Vec::new());
             progress.check()?;
@@ -263,7 +267,7 @@ mod tests {
         {
             let is_valid = |i: u32| uniform(i, 0, count as u32) < part;
             let by_corners = |c: [Vec3; 3]| is_valid(c[0].x as u32);
-            let found = References::of_valid(count, &corners, by_corners, &Progress::none()).unwrap();
+            let found = References::of_valid(count, &corners, by_corners, Storage::MEMORY, &Progress::none()).unwrap();
             let ids: Vec<u32> = found.refs.iter().map(Reference::id).collect();
             let (valid, skipped): (Vec<u32>, Vec<u32>) = (0..count as u32).partition(|&i| is_valid(i));
             assert_eq!((ids, &found.skipped), (valid, &skipped));

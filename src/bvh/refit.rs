@@ -139,6 +139,7 @@ mod tests {
     use super::*;
     use crate::base::progress::Progress;
     use crate::base::sampling::{uniform, uniform_sphere};
+    use crate::base::scratch_files::Storage;
     use crate::simd::Isa;
 
     use crate::trace::{Kernels, RawHit, Ray};
@@ -167,7 +168,7 @@ mod tests {
         let valid: Vec<u32> = (0..corners.len() as u32).filter(|&t| is_valid_triangle(corners[t as usize])).collect();
         let (none, of) = (Progress::none(), |t: u32| corners[t as usize]);
         let references = References::of(&valid, &of).unwrap();
-        collapse(&build_binary(&of, references, options, &none).unwrap(), &of, &none).unwrap()
+        collapse(&build_binary(&of, references, options, Storage::MEMORY, &none).unwrap(), &of, &none).unwrap()
     }
 
     /// The tree after a refit, and the triangles that no ray can hit.

@@ -424,7 +424,7 @@ impl BinaryBvh {
         let extra = ((n as f64 * f64::from(options.split_budget)) as usize).min(MAX_SLOTS - n.min(MAX_SLOTS));
         let least_overlap = extent.boxes.half_area() * f64::from(ALPHA);
         let builder = Builder { corners, options, progress, least_overlap, out_of_memory: AtomicBool::new(false) };
-        let piece = builder.build(refs, extent, extra, 0);
+        let piece = builder.build(refs.into(), extent, extra, 0);
         progress.check()?;
         if builder.out_of_memory.into_inner() {
             return Err(Error::OutOfMemory(format!("the tree over {n} triangles with spatial splits")));
@@ -433,7 +433,7 @@ impl BinaryBvh {
         let mut nodes = try_zeroed::<BinaryNode>(node_count, "the binary tree")?;
         let mut triangles = try_zeroed::<u32>(triangle_count, "the binary tree")?;
         piece.write(&mut nodes, &mut triangles, 0, 0);
-        Ok(BinaryBvh { nodes, triangles })
+        Ok(BinaryBvh { nodes: nodes.into(), triangles: triangles.into() })
     }
 }
 

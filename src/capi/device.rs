@@ -136,12 +136,14 @@ pub struct bk_device_desc {
     /// this user only: files are checked, but charts that somebody else put there would be used.
     /// UTF-8; NULL: none are kept. Default: NULL.
     pub cache_folder: *const c_char,
-    /// Folder for files that take the place of memory for the charts of light maps, where scenes are
-    /// larger than it (see bk_open_params.ray_queues): some 50 bytes per triangle, three times that
-    /// while a light map is created. The folder must exist; the files have no names in it, and
-    /// their room is free again when the light map is gone (64 MB of it: when the device is), however
-    /// the process ends. The library never writes more to them than there is room on the disk. UTF-8; NULL: all is in memory.
-    /// Default: NULL.
+    /// Folder for files that take the place of memory, where scenes are larger than it (see
+    /// bk_open_params.ray_queues): for copies of meshes, the acceleration structure (up to 250 bytes
+    /// per triangle while a scene is committed, up to 110 after it) and the charts of light maps
+    /// (some 50 bytes per triangle, three times that while a light map is created). The folder must
+    /// exist; the files have no names in it, and their room is free again when scene and light map
+    /// are gone (64 MB of it: when the device is), however the process ends. The library never
+    /// writes more to them than there is room on the disk. Arrays of less than 4 KB, textures and
+    /// texels are in memory as ever, and scenes from bk_scene_open in their file. UTF-8; NULL: all is in memory. Default: NULL.
     pub scratch_folder: *const c_char,
 }
 

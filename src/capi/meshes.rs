@@ -18,6 +18,8 @@ use super::error::{BK_NONE, bk_result, call, call_or};
 use super::handles::{hold, object};
 use super::scene::bk_scene;
 use crate::base::error::{Result, invalid_argument};
+use crate::base::memory::Reservation;
+use crate::base::progress::Progress;
 use crate::scene::{LightmapUvs, Material, Mesh, MeshMaterials, NONE, SceneData};
 use glam::{Vec2, Vec3};
 
@@ -232,6 +234,7 @@ pub unsafe extern "C" fn bk_mesh_desc_init(desc: *mut bk_mesh_desc) {
 ///   BK_MESH_STRICT; bk_last_error names triangle and vertex
 /// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the copy does not fit or the memory callback refuses
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_add_mesh(
     scene: *mut bk_scene,
@@ -243,7 +246,14 @@ pub unsafe extern "C" fn bk_scene_add_mesh(
         // The memory callback may release it.
         let scene = hold(scene, "scene")?;
         let desc = read_struct(desc, "desc")?;
-        let id = scene.describe_large("meshes can be added", bytes(&desc), || read_mesh(&desc), SceneData::add_mesh)?;
+        let device = &scene.device;
+        let read = |held: &mut Reservation| {
+            let mut mesh = read_mesh(&desc)?;
+            device.install(|| mesh.move_to(device.storage(), &Progress::none()))?;
+            held.shrink(held.bytes() - mesh.mapped_bytes());
+            Ok(mesh)
+        };
+        let id = scene.describe_large("meshes can be added", bytes(&desc), read, SceneData::add_mesh)?;
         write_optional(out_id, id)
     })
 }

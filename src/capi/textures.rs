@@ -89,7 +89,7 @@ pub unsafe extern "C" fn bk_scene_add_texture(
         // The memory callback may release it.
         let scene = hold(scene, "scene")?;
         let desc = read_struct(desc, "desc")?;
-        let read = || read_texture(&desc);
+        let read = |_: &mut _| read_texture(&desc);
         let id = scene.describe_large("textures can be added", bytes(&desc, 4), read, SceneData::add_texture)?;
         write_optional(out_id, id)
     })
@@ -132,7 +132,7 @@ pub unsafe extern "C" fn bk_scene_add_environment(
         let id = scene.describe_large(
             "environments can be added",
             bytes(&desc, 16),
-            || read_environment(&desc),
+            |_| read_environment(&desc),
             |data, environment| Ok(data.add_environment(environment)),
         )?;
         write_optional(out_id, id)

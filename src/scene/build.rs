@@ -3,14 +3,16 @@
 use super::committed::{SceneStats, Uses, object_of};
 use super::emitters::{EMITTERS, add_emitters, emissive_triangles};
 use super::instance_trees;
+use super::kept_trees::{EarlierTrees, KeptTree};
 use super::precision::too_few_digits;
-use super::{Emitter, Material, MeshMaterials, NONE, Scene, SceneData, is_valid_triangle};
+use super::{Emitter, Material, Mesh, MeshMaterials, NONE, Scene, SceneData, is_valid_triangle};
 use crate::base::error::{Error, Result};
 use crate::base::geometry::MAX_COORDINATE;
 use crate::base::memory::{Reservation, try_with_capacity};
 use crate::base::progress::Progress;
+use crate::base::scratch_files::{LEAST_IN_SCRATCH, Storage};
 use crate::bvh::instances::Instances;
-use crate::bvh::{self, BuildOptions, References, Tree};
+use crate::bvh::{self, BuildOptions, BuildStorage, References, Tree};
 use crate::device::{Device, LogLevel};
 use glam::Vec3;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -59,8 +61,45 @@ impl Scene {
         options: &BuildOptions,
         progress: &Progress,
     ) -> std::result::Result<Arc<Scene>, (SceneData, Error)> {
-        // The build only reads `data`, and a panic drops everything that the build has made.
-        let build = AssertUnwindSafe(|| device.run(progress, || Self::build(device, &data, options, progress)));
+        Self::commit_with(device, data, options, None, progress)
+    }
+
+    /// Commits a scene as [`commit`](Self::commit) does, and takes over trees of an `earlier` one of any device: that of
+    /// the meshes without instances, if these have the same triangles in the same order, and that of each mesh with
+    /// instances that had the same triangles and some instance there. Placement, materials and all else may be others.
+    /// Trees in which a refit has moved a mesh, or that are compact where `options` asks for full ones (or the other way
+    /// round), are built anew. Other options are those with which the trees were built. Rays hit the same as without, but
+    /// for what [`BuildOptions::compact`] says of spatial splits.
+    #[allow(clippy::result_large_err)]
+    pub fn commit_from(
+        device: &Arc<Device>,
+        data: SceneData,
+        options: &BuildOptions,
+        earlier: &Scene,
+        progress: &Progress,
+    ) -> std::result::Result<Arc<Scene>, (SceneData, Error)> {
+        Self::commit_with(device, data, options, Some(earlier), progress)
+    }
+
+    #[allow(clippy::result_large_err)]
+    fn commit_with(
+        device: &Arc<Device>,
+        mut data: SceneData,
+        options: &BuildOptions,
+        earlier: Option<&Scene>,
+        progress: &Progress,
+    ) -> std::result::Result<Arc<Scene>, (SceneData, Error)> {
+        // The build changes nothing but where arrays of `data` lie, and a panic drops everything that the build has made.
+        let build = AssertUnwindSafe(|| {
+            device.run(progress, || {
+                if device.has_scratch() {
+                    let _held = device.memory().reserve(data.bytes_in_memory(), "the scene")?;
+                    device.install(|| data.move_to(device.storage(), progress))?;
+                }
+                let build = || Self::build(device, &data, options, earlier, progress);
+                earlier.map_or_else(build, |earlier| earlier.while_unchanged(build))
+            })
+        });
         let built = catch_unwind(build).unwrap_or_else(|payload| Err(Error::of_panic(payload)));
         match built {
             Ok(parts) => {
@@ -83,7 +122,13 @@ impl Scene {
         }
     }
 
-    fn build(device: &Arc<Device>, data: &SceneData, options: &BuildOptions, progress: &Progress) -> Result<Parts> {
+    fn build(
+        device: &Arc<Device>,
+        data: &SceneData,
+        options: &BuildOptions,
+        earlier: Option<&Scene>,
+        progress: &Progress,
+    ) -> Result<Parts> {
         let start = Instant::now();
         let total = data.triangle_count();
         if total == 0 {
@@ -91,24 +136,32 @@ impl Scene {
         }
         let stage = progress.stage("bvh", 0.0, 1.0, 1);
         let first_triangle = data.first_triangles()?;
-        let meshes = data.bytes();
         let own = data.own_triangles;
-        let estimate = bvh::estimated_bytes(own, options) + instance_trees::estimated_bytes(data, options);
+        options.validate()?;
+        let work = device.files_for_work();
+        let storage = BuildStorage::new(device.storage(), Storage::new(work.as_ref()), options);
+        // Of small trees some arrays are in memory.
+        let is_in_memory = |triangles: usize| !storage.work.is_files() || triangles < LEAST_IN_SCRATCH;
+        let estimate = if is_in_memory(own) { bvh::estimated_bytes(own, options) } else { 0 }
+            + instance_trees::estimated_bytes(data, options, is_in_memory);
         let of_instances = bytes_of_instances(data, &first_triangle);
-        let memory = device.memory().reserve(meshes + of_instances + estimate, "the scene")?;
-        let instances = device.install(|| instance_trees::build(data, &first_triangle, options, progress))?;
-        let corners = |t: u32| {
-            let object = object_of(&first_triangle, t);
-            data.object(object as u32).corners(t - first_triangle[object])
+        let memory = device.memory().reserve(data.bytes_in_memory() + of_instances + estimate, "the scene")?;
+        let earlier = earlier.map(|e| device.install(|| EarlierTrees::of(e, options.compact, storage.tree, progress)));
+        let earlier = earlier.transpose()?;
+        let build = || instance_trees::build(data, &first_triangle, options, storage, earlier.as_ref(), progress);
+        let instances = device.install(build)?;
+        let of_own = &first_triangle[..=data.meshes.len()];
+        let kept = earlier.as_ref().map(|e| device.install(|| e.own(data, of_own))).transpose()?.flatten();
+        let KeptTree { tree, skipped, sah_cost } = match kept {
+            Some(kept) => kept,
+            None => device.install(|| own_tree(data, &first_triangle, options, storage, progress))?,
         };
-        let mut references = device.install(|| References::of_valid(own, &corners, is_valid_triangle, progress))?;
         progress.check()?;
-        if references.len() == 0 && !instances.as_ref().is_some_and(Instances::are_hit) {
+        if tree.is_nothing() && !instances.as_ref().is_some_and(Instances::are_hit) {
             return Err(Error::InvalidState(format!(
                 "all {total} triangles of the scene are degenerate, not finite or beyond {MAX_COORDINATE:e} units"
             )));
         }
-        let skipped = std::mem::take(&mut references.skipped);
         let all_skipped = skipped.len() + instances.as_ref().map_or(0, Instances::skipped);
         if all_skipped > 0 {
             device.log(
@@ -116,18 +169,44 @@ impl Scene {
                 &format!("{all_skipped} of {total} triangles are degenerate or not finite and were skipped"),
             );
         }
-        let (tree, sah_cost) = match references.len() {
-            0 => (Tree::nothing(), 0.0),
-            _ => {
-                let own = &first_triangle[..=data.meshes.len()];
-                device.install(|| bvh::build(&corners, references, own, options, progress))?
-            }
-        };
-        progress.check()?;
-
         stage.advance(1)?;
-        device.install(|| Parts::of(data, Built { first_triangle, tree, skipped, instances, sah_cost }, memory, start))
+        let built = Built { first_triangle, tree, skipped, instances, sah_cost };
+        let mut parts = device.install(|| Parts::of(data, built, memory, start))?;
+        parts.stats.kept_triangles = earlier.map_or(0, |e| e.kept());
+        let trees = parts.instances.iter().flat_map(|i| i.trees.iter().map(|t| &t.tree)).chain([&parts.tree]);
+        let in_files = data.bytes() - data.bytes_in_memory() + trees.map(Tree::mapped_bytes).sum::<usize>();
+        if in_files > 0 {
+            data.meshes.iter().for_each(Mesh::at_random);
+            parts.stats.mapped_bytes = in_files as u64;
+            let in_memory = parts.stats.bytes as usize - in_files;
+            parts.memory.grow(in_memory, "the scene")?;
+            parts.memory.shrink(in_memory);
+        }
+        Ok(parts)
     }
+}
+
+/// Builds the tree of the meshes without instances.
+fn own_tree(
+    data: &SceneData,
+    first_triangle: &[u32],
+    options: &BuildOptions,
+    storage: BuildStorage,
+    progress: &Progress,
+) -> Result<KeptTree> {
+    let corners = |t: u32| {
+        let object = object_of(first_triangle, t);
+        data.object(object as u32).corners(t - first_triangle[object])
+    };
+    let mut references = References::of_valid(data.own_triangles, &corners, is_valid_triangle, storage.work, progress)?;
+    progress.check()?;
+    let skipped = std::mem::take(&mut references.skipped);
+    let own = &first_triangle[..=data.meshes.len()];
+    let (tree, sah_cost) = match references.len() {
+        0 => (Tree::nothing(), 0.0),
+        _ => bvh::build(&corners, references, own, options, storage, progress)?,
+    };
+    Ok(KeptTree { tree, skipped, sah_cost })
 }
 
 /// Size of what there is of each triangle of an instance, and not of each of a mesh alone.
@@ -191,6 +270,7 @@ impl Parts {
             wide_sah_cost: tree.sah_cost(),
             refits: 0,
             refit_seconds: 0.0,
+            kept_triangles: 0,
         };
         let (bounds, extent) = instance_trees::bounds_and_extent(data, &tree, instances.as_ref());
         let instances = instances.map(Box::new);
@@ -210,6 +290,7 @@ impl Parts {
             bounds,
             extent,
             tree,
+            is_refitted: false,
             skipped,
             instances,
             parts: None,

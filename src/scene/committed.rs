@@ -49,6 +49,9 @@ pub struct SceneStats {
     pub refits: u32,
     /// Wall time of the last refit, 0 if there was none.
     pub refit_seconds: f64,
+    /// Number of triangles, those of a mesh with instances counted once, whose trees were taken over from an earlier scene
+    /// ([`commit_from`](Scene::commit_from)).
+    pub kept_triangles: u64,
 }
 
 /// A committed scene. Queries are safe from any number of threads.
@@ -66,6 +69,8 @@ pub struct Scene {
     pub(super) extent: f32,
     /// Tree of the meshes without instances.
     pub(super) tree: Tree,
+    /// Whether a refit has moved a mesh in it: a tree built anew may be better, and have triangles that were none.
+    pub(super) is_refitted: bool,
     /// Triangles that are not in that tree, ascending.
     pub(super) skipped: Vec<u32>,
     /// Trees of meshes with instances; `None` if there are none.
@@ -96,6 +101,12 @@ impl Scene {
     /// The device of the scene.
     pub fn device(&self) -> &Arc<Device> {
         &self.device
+    }
+
+    /// Number of bytes of meshes and trees that lie in scratch files, or in the file that the scene was opened from.
+    pub(super) fn bytes_in_files(&self) -> usize {
+        let trees = self.instances.iter().flat_map(|i| i.trees.iter().map(|t| &t.tree)).chain([&self.tree]);
+        self.data.bytes() - self.data.bytes_in_memory() + trees.map(Tree::mapped_bytes).sum::<usize>()
     }
 
     /// Fails if the scene lies in a mapped file that somebody has changed since: nothing that was computed after that can

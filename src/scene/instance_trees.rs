@@ -1,12 +1,13 @@
 //! The trees of a scene's instances: built at the commit, and after refits.
 
+use super::kept_trees::EarlierTrees;
 use super::{Instance, SceneData, is_valid_triangle};
 use crate::base::error::Result;
 use crate::base::geometry::MAX_COORDINATE;
 use crate::base::memory::{try_collect, try_par_collect, try_par_gather};
 use crate::base::progress::Progress;
 use crate::bvh::instances::{Instances, Margin, MeshTree, PlacedTree, placed_box};
-use crate::bvh::{self, BuildOptions, References, RefitRoom, Tree};
+use crate::bvh::{self, BuildOptions, BuildStorage, References, RefitRoom, Tree};
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -18,9 +19,10 @@ pub(super) fn instanced(data: &SceneData) -> impl Iterator<Item = u32> {
     (0..data.meshes.len() as u32).filter(|&m| data.is_instanced(m))
 }
 
-/// Upper bound of the trees' size together with the builder's working memory.
-pub(super) fn estimated_bytes(data: &SceneData, options: &BuildOptions) -> usize {
-    let triangles: usize = instanced(data).map(|m| data.meshes[m as usize].indices.len()).sum();
+/// Upper bound of the size of the trees of meshes with as many triangles as `counts` says, and of what there is of each
+/// instance, together with the builder's working memory.
+pub(super) fn estimated_bytes(data: &SceneData, options: &BuildOptions, counts: impl Fn(usize) -> bool) -> usize {
+    let triangles: usize = instanced(data).map(|m| data.meshes[m as usize].indices.len()).filter(|&n| counts(n)).sum();
     bvh::estimated_bytes(triangles, options) + estimated_bytes_of_places(data.instances.len(), options)
 }
 
@@ -31,11 +33,13 @@ pub(super) fn estimated_bytes_of_places(instances: usize, options: &BuildOptions
     bvh::estimated_bytes(instances, &top) + instances * per_instance
 }
 
-/// Builds the trees; `None` if the scene has no instances.
+/// Builds the trees, or takes over those that `earlier` has; `None` if the scene has no instances.
 pub(super) fn build(
     data: &SceneData,
     first_triangle: &[u32],
     options: &BuildOptions,
+    storage: BuildStorage,
+    earlier: Option<&EarlierTrees>,
     progress: &Progress,
 ) -> Result<Option<Instances>> {
     if data.instances.is_empty() {
@@ -43,7 +47,11 @@ pub(super) fn build(
     }
     let meshes = try_collect(instanced(data), TREES)?;
     let trees = try_par_gather(meshes.len(), TREES, |i, out: &mut Vec<MeshTree>| {
-        out.push(tree_of(data, meshes[i], options, progress)?);
+        let kept = earlier.map(|e| e.of_mesh(&data.meshes[meshes[i] as usize], meshes[i])).transpose()?.flatten();
+        out.push(match kept {
+            Some(tree) => tree,
+            None => tree_of(data, meshes[i], options, storage, progress)?,
+        });
         Ok(())
     })?;
     place(data, first_triangle, trees, progress).map(Some)
@@ -81,6 +89,7 @@ pub(super) fn refit(
     has_moved: impl Fn(u32) -> bool + Sync,
 ) -> usize {
     let of_tree = |(t, room): (&mut MeshTree, RefitRoom)| {
+        t.is_refitted |= has_moved(t.mesh);
         if !t.is_hit() || !has_moved(t.mesh) {
             return t.gone;
         }
@@ -148,19 +157,25 @@ pub(super) fn bounds_and_extent(data: &SceneData, own: &Tree, instances: Option<
     ((lower, upper), (upper - lower).length().max(reach))
 }
 
-fn tree_of(data: &SceneData, number: u32, options: &BuildOptions, progress: &Progress) -> Result<MeshTree> {
+fn tree_of(
+    data: &SceneData,
+    number: u32,
+    options: &BuildOptions,
+    storage: BuildStorage,
+    progress: &Progress,
+) -> Result<MeshTree> {
     let mesh = &data.meshes[number as usize];
     let total = mesh.indices.len();
     let corners = |t: u32| mesh.corners(t as usize);
-    let mut references = References::of_valid(total, &corners, is_valid_triangle, progress)?;
+    let mut references = References::of_valid(total, &corners, is_valid_triangle, storage.work, progress)?;
     progress.check()?;
     let skipped = std::mem::take(&mut references.skipped);
     let range = [0, total as u32];
     let tree = match references.len() {
         0 => Tree::nothing(),
-        _ => bvh::build(&corners, references, &range, options, progress)?.0,
+        _ => bvh::build(&corners, references, &range, options, storage, progress)?.0,
     };
-    Ok(MeshTree { mesh: number, range, tree, skipped, gone: 0 })
+    Ok(MeshTree { mesh: number, range, tree, skipped, gone: 0, is_refitted: false })
 }
 
 /// Whether a triangle of an object is in no tree: `own` are the skipped triangles of meshes without instances, by their

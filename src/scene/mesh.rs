@@ -4,7 +4,8 @@ use super::MAX_TRIANGLES;
 use crate::base::array::Array;
 use crate::base::error::{Result, invalid_argument};
 use crate::base::geometry::is_valid_triangle;
-use crate::base::memory::try_to_vec;
+use crate::base::progress::Progress;
+use crate::base::scratch_files::Storage;
 use glam::{Vec2, Vec3};
 
 /// Assignment of materials to triangles.
@@ -82,12 +83,25 @@ impl Mesh {
 
     /// Size of the mesh's arrays in bytes.
     pub(super) fn bytes(&self) -> usize {
-        let per_triangle = if let MeshMaterials::PerTriangle(m) = &self.materials { size_of_val(&m[..]) } else { 0 };
-        let lightmap = self.lightmap.as_ref().map_or(0, |l| size_of_val(&l.uvs[..]) + size_of_val(&l.pages[..]));
-        size_of_val(&self.positions[..])
-            + size_of_val(&self.indices[..])
-            + size_of_val(&self.normals[..])
-            + size_of_val(&self.uvs[..])
+        self.bytes_of_arrays(|_| true)
+    }
+
+    /// Size in bytes of those arrays that lie in files.
+    pub(crate) fn mapped_bytes(&self) -> usize {
+        self.bytes_of_arrays(|is_mapped| is_mapped)
+    }
+
+    /// Sums the sizes of the arrays that count, by whether they lie in files.
+    fn bytes_of_arrays(&self, counts: impl Fn(bool) -> bool) -> usize {
+        fn size<T>(array: &Array<T>, counts: impl Fn(bool) -> bool) -> usize {
+            if counts(array.is_mapped()) { size_of_val(&array[..]) } else { 0 }
+        }
+        let per_triangle = if let MeshMaterials::PerTriangle(m) = &self.materials { size(m, &counts) } else { 0 };
+        let lightmap = self.lightmap.as_ref().map_or(0, |l| size(&l.uvs, &counts) + size(&l.pages, &counts));
+        size(&self.positions, &counts)
+            + size(&self.indices, &counts)
+            + size(&self.normals, &counts)
+            + size(&self.uvs, &counts)
             + lightmap
             + per_triangle
     }
@@ -107,24 +121,51 @@ impl Mesh {
         }
     }
 
-    /// Copies the mesh; fails if there is not enough memory.
-    pub(super) fn try_clone(&self) -> Result<Mesh> {
-        let what = "a copy of a mesh";
+    /// Moves arrays that are in memory to scratch files, if these are the storage.
+    pub(crate) fn move_to(&mut self, storage: Storage, progress: &Progress) -> Result<()> {
+        storage.take_in(&mut self.positions, progress)?;
+        storage.take_in(&mut self.indices, progress)?;
+        storage.take_in(&mut self.normals, progress)?;
+        storage.take_in(&mut self.uvs, progress)?;
+        if let Some(l) = &mut self.lightmap {
+            storage.take_in(&mut l.uvs, progress)?;
+            storage.take_in(&mut l.pages, progress)?;
+        }
+        if let MeshMaterials::PerTriangle(m) = &mut self.materials {
+            storage.take_in(m, progress)?;
+        }
+        Ok(())
+    }
+
+    /// Tells the system that rays will read what they need and lies in files here and there.
+    pub(super) fn at_random(&self) {
+        self.positions.at_random();
+        self.indices.at_random();
+        self.normals.at_random();
+        self.uvs.at_random();
+        if let MeshMaterials::PerTriangle(m) = &self.materials {
+            m.at_random();
+        }
+    }
+
+    /// Copies the mesh to `storage`; fails if there is not enough room.
+    pub(super) fn copy(&self, storage: Storage) -> Result<Mesh> {
+        let (what, none) = ("a copy of a mesh", Progress::none());
         Ok(Mesh {
-            positions: try_to_vec(&self.positions, what)?.into(),
-            indices: try_to_vec(&self.indices, what)?.into(),
-            normals: try_to_vec(&self.normals, what)?.into(),
-            uvs: try_to_vec(&self.uvs, what)?.into(),
+            positions: storage.copy(&self.positions, what, &none)?,
+            indices: storage.copy(&self.indices, what, &none)?,
+            normals: storage.copy(&self.normals, what, &none)?,
+            uvs: storage.copy(&self.uvs, what, &none)?,
             lightmap: match &self.lightmap {
                 Some(l) => Some(LightmapUvs {
-                    uvs: try_to_vec(&l.uvs, what)?.into(),
-                    pages: try_to_vec(&l.pages, what)?.into(),
+                    uvs: storage.copy(&l.uvs, what, &none)?,
+                    pages: storage.copy(&l.pages, what, &none)?,
                 }),
                 None => None,
             },
             materials: match &self.materials {
                 MeshMaterials::One(m) => MeshMaterials::One(*m),
-                MeshMaterials::PerTriangle(m) => MeshMaterials::PerTriangle(try_to_vec(m, what)?.into()),
+                MeshMaterials::PerTriangle(m) => MeshMaterials::PerTriangle(storage.copy(m, what, &none)?),
             },
             strict: self.strict,
         })

@@ -9,6 +9,7 @@ mod emitters;
 mod environment;
 mod instance;
 mod instance_trees;
+mod kept_trees;
 mod light;
 mod material;
 mod mesh;
@@ -34,6 +35,8 @@ pub use texture::{MAX_TEXTURE_SIZE, Texture};
 
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::memory::{try_filled, try_push, try_to_vec, try_with_capacity};
+use crate::base::progress::Progress;
+use crate::base::scratch_files::Storage;
 use std::borrow::Cow;
 use std::sync::Arc;
 
@@ -245,9 +248,14 @@ impl SceneData {
 
     /// Copies the data as [`clone`](Clone::clone) does, but fails if there is not enough memory.
     pub fn try_clone(&self) -> Result<SceneData> {
+        self.copy(Storage::MEMORY)
+    }
+
+    /// Copies the data, the meshes to `storage`.
+    fn copy(&self, storage: Storage) -> Result<SceneData> {
         let mut meshes = try_with_capacity(self.meshes.len(), "a copy of the scene")?;
         for mesh in &self.meshes {
-            meshes.push(mesh.try_clone()?);
+            meshes.push(mesh.copy(storage)?);
         }
         let SceneData { materials, lights, textures, environments, .. } = self;
         let what = "a copy of the scene";
@@ -275,6 +283,16 @@ impl SceneData {
         let textures: usize = self.textures.iter().map(|t| t.bytes()).sum();
         let environments: usize = self.environments.iter().map(|e| e.bytes()).sum();
         self.mesh_bytes() + textures + environments
+    }
+
+    /// Moves the arrays of meshes that are in memory to scratch files, if these are the storage.
+    pub(crate) fn move_to(&mut self, storage: Storage, progress: &Progress) -> Result<()> {
+        self.meshes.iter_mut().try_for_each(|mesh| mesh.move_to(storage, progress))
+    }
+
+    /// The same without the arrays of meshes that lie in files.
+    pub(crate) fn bytes_in_memory(&self) -> usize {
+        self.bytes() - self.meshes.iter().map(Mesh::mapped_bytes).sum::<usize>()
     }
 
     /// Size of the arrays of meshes and instances in bytes.

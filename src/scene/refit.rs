@@ -7,6 +7,7 @@ use super::{Emitter, Instance, Scene, is_valid_triangle};
 use crate::base::error::{Error, Result, invalid_argument};
 use crate::base::geometry::MAX_COORDINATE;
 use crate::base::memory::{try_to_vec, try_with_capacity};
+use crate::base::progress::Progress;
 use crate::bvh;
 use crate::bvh::instances::Instances;
 use crate::device::LogLevel;
@@ -152,6 +153,7 @@ impl Scene {
         };
         let own_triangles = data.own_triangles as u32;
         let has_own_moved = (0..data.meshes.len() as u32).any(|m| !data.is_instanced(m) && has_moved(m));
+        self.is_refitted |= has_own_moved;
         if has_own_moved && own_triangles > self.skipped.len() as u32 {
             self.tree.refit(&corners, own);
         }
@@ -181,27 +183,32 @@ impl Scene {
         // Textures and environments are shared.
         let of_instances = self.instances.as_ref().map_or(0, |i| i.bytes());
         let bytes = self.tree.bytes() + of_instances + self.data.mesh_bytes();
-        let memory = self.device.memory().reserve(bytes, COPY)?;
-        Ok(Scene {
+        let storage = self.device.storage();
+        let memory = self.device.memory().reserve(self.device.in_memory(bytes), COPY)?;
+        let mut copy = Scene {
             device: self.device.clone(),
-            data: self.data.try_clone()?,
+            data: self.data.copy(storage)?,
             lights: self.lights.clone(),
             emitters: Vec::new(),
             first_triangle: try_to_vec(&self.first_triangle, COPY)?,
             bounds: self.bounds,
             extent: self.extent,
-            tree: self.tree.try_clone()?,
+            tree: self.tree.copy(storage, &Progress::none())?,
+            is_refitted: self.is_refitted,
             skipped: try_to_vec(&self.skipped, COPY)?,
             instances: match &self.instances {
-                Some(instances) => Some(Box::new(instances.try_clone()?)),
+                Some(instances) => Some(Box::new(instances.copy(storage)?)),
                 None => None,
             },
-            // What a refit writes is in memory.
+            // Rays wait at parts of a scene file, which this is no more.
             parts: None,
             file: None,
             uses: self.uses.clone(),
             stats: self.stats,
             _memory: memory,
-        })
+        };
+        copy.stats.mapped_bytes = copy.bytes_in_files() as u64;
+        copy._memory.grow(bytes.saturating_sub(copy.bytes_in_files()), COPY)?;
+        Ok(copy)
     }
 }

@@ -6,6 +6,7 @@ use super::{RawHit, Ray, single, stream};
 use crate::base::error::{Result, invalid_argument};
 use crate::base::geometry::is_valid_triangle;
 use crate::base::progress::Progress;
+use crate::base::scratch_files::Storage;
 use crate::bvh::{self, BuildOptions, ChildRef, Mbvh, References};
 use crate::scene::Scene;
 use crate::simd::{self, Isa, entry_point, isa_features};
@@ -24,7 +25,13 @@ impl FourWide {
     pub fn new(scene: &Scene, options: &BuildOptions) -> Result<FourWide> {
         let (corners, none) = (|t: u32| scene.corners(t), Progress::none());
         let tree = scene.device().install(|| {
-            let references = References::of_valid(scene.triangle_count() as usize, &corners, is_valid_triangle, &none)?;
+            let references = References::of_valid(
+                scene.triangle_count() as usize,
+                &corners,
+                is_valid_triangle,
+                Storage::MEMORY,
+                &none,
+            )?;
             if references.len() == 0 {
                 return invalid_argument!("the scene has no triangle that can be hit");
             }

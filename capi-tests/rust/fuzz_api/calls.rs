@@ -419,9 +419,13 @@ fn commit(w: &W, s: &mut Source) {
         ask!(bk_scene_commit(scene.p(), None, null_mut()));
         return;
     }
+    let earlier = if s.one_in(3) { w.pick(Kind::Scene, s) } else { None };
     let watched = Watched::new(w, s);
-    let result = ask!(bk_scene_commit(scene.p(), Some(progress), watched.user()));
-    watched.end("bk_scene_commit", result);
+    let result = match earlier {
+        Some(earlier) => ask!(bk_scene_commit_from(scene.p(), earlier.p(), Some(progress), watched.user())),
+        None => ask!(bk_scene_commit(scene.p(), Some(progress), watched.user())),
+    };
+    watched.end("bk_scene_commit or bk_scene_commit_from", result);
 }
 
 fn refit(w: &W, s: &mut Source) {
@@ -1139,6 +1143,7 @@ fn null_handles(s: &mut Source) {
             failed(ask!(bk_device_create(null(), null_mut())));
             failed(ask!(bk_scene_create(null_mut(), words.as_mut_ptr().cast())));
             failed(ask!(bk_scene_commit(null_mut(), None, null_mut())));
+            failed(ask!(bk_scene_commit_from(null_mut(), null(), None, null_mut())));
             failed(ask!(bk_scene_refit(null_mut())));
             failed(ask!(bk_scene_save(null_mut(), c"x".as_ptr(), None, null_mut())));
             failed(ask!(bk_scene_open(null_mut(), c"x".as_ptr(), null(), None, null_mut())));

@@ -69,6 +69,10 @@ impl<'a> Job<'a> {
             let name = &self.args.scene;
             return Err(Error::InvalidArgument(format!("{name} is opened as it was saved; --repeat does not apply")));
         }
+        if self.args.trees_from.is_some() {
+            let name = &self.args.scene;
+            return Err(Error::InvalidArgument(format!("{name} has its trees; --trees-from does not apply")));
+        }
         if self.args.share_light {
             let name = &self.args.scene;
             return Err(Error::InvalidArgument(format!(
@@ -133,8 +137,21 @@ impl<'a> Job<'a> {
 
     /// Commits the scene and notes what its tree took.
     pub fn commit_on(&mut self, device: &Arc<Device>, data: SceneData, build: &BuildOptions) -> Result<Arc<Scene>> {
+        let earlier = match &self.args.trees_from {
+            Some(path) => Some(self.bars.show("open", |p| Scene::open(device, path, &OpenOptions::default(), p))?),
+            None => None,
+        };
         let start = Instant::now();
-        let scene = self.bars.show("scene", |p| Scene::commit(device, data, build, p).map_err(|(_, e)| e))?;
+        let commit = |p: &Progress| match &earlier {
+            Some(earlier) => Scene::commit_from(device, data, build, earlier, p),
+            None => Scene::commit(device, data, build, p),
+        };
+        let scene = self.bars.show("scene", |p| commit(p).map_err(|(_, e)| e))?;
+        if earlier.is_some() {
+            let all: usize = scene.meshes().iter().map(|m| m.indices.len()).sum();
+            let kept = scene.stats().kept_triangles;
+            self.bars.say(&format!("trees of {kept} of {all} triangles were taken over"));
+        }
         self.stage("tree", start).bytes = scene.stats().bvh_bytes;
         Ok(scene)
     }

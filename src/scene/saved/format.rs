@@ -266,5 +266,6 @@ pub(super) struct SavedTree {
     pub upper: [f32; 3],
     /// See [`SceneStats::sah_cost`](crate::scene::SceneStats::sah_cost); 0 for meshes with instances.
     pub sah_cost: f32,
-    pub reserved: u32,
+    /// 1: a refit has moved a mesh in it; 0: none has, or the file is of an earlier build.
+    pub is_refitted: u32,
 }

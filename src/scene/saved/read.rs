@@ -211,7 +211,8 @@ impl File {
             let range = [0, data.meshes[mesh as usize].indices.len() as u32];
             let (tree, skipped) = arrays.next(saved, &range).map_err(what)?.ok_or_else(missing)?;
             let gone = saved.gone.min(u64::from(range[1])) as usize;
-            of_meshes.push(MeshTree { mesh, range, tree, skipped, gone });
+            let is_refitted = saved.is_refitted != 0;
+            of_meshes.push(MeshTree { mesh, range, tree, skipped, gone, is_refitted });
         }
         if trees.next().is_some() || !arrays.are_used_up() {
             return Err(missing());
@@ -226,6 +227,7 @@ impl File {
         }) {
             return Err(damaged(path, "a tree in it is none"));
         }
+        let is_refitted = own.is_refitted != 0;
         let own_gone = own.gone.min(data.own_triangles as u64) as usize;
         let gone = own_gone + of_meshes.iter().map(|t| t.gone).sum::<usize>();
         let instances = match of_meshes.is_empty() {
@@ -237,6 +239,7 @@ impl File {
         parts.stats.skipped_degenerate += gone as u64;
         parts.stats.build_seconds = start.elapsed().as_secs_f64();
         let mut scene = parts.into_scene(device.clone(), data);
+        scene.is_refitted = is_refitted;
         let is_in_place = |e: &&Entry| IN_PLACE.iter().any(|&kind| kind as u32 == e.kind);
         if self.mapped.is_some() {
             scene.stats.mapped_bytes = self.table.iter().filter(is_in_place).map(|e| e.bytes).sum();

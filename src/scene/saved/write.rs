@@ -114,8 +114,9 @@ impl Writer<'_, '_> {
         // Triangles of meshes with instances are counted once.
         let elsewhere: usize = of_instances().map(|t| t.skipped.len() + t.gone).sum();
         let own_gone = (scene.stats.skipped_degenerate as usize).saturating_sub(scene.skipped.len() + elsewhere);
-        let own = saved(NONE, &scene.tree, scene.skipped.len(), own_gone, scene.stats.sah_cost);
-        let others = of_instances().map(|t| saved(t.mesh, &t.tree, t.skipped.len(), t.gone, 0.0));
+        let sah_cost = scene.stats.sah_cost;
+        let own = SavedTree { sah_cost, ..saved(NONE, &scene.tree, scene.skipped.len(), own_gone, scene.is_refitted) };
+        let others = of_instances().map(|t| saved(t.mesh, &t.tree, t.skipped.len(), t.gone, t.is_refitted));
         self.records(Kind::Trees, [own].into_iter().chain(others))?;
         let trees = || [&scene.tree].into_iter().chain(of_instances().map(|t| &t.tree));
         let whole = || trees().filter_map(|t| if let Tree::Whole(t) = t { Some(t) } else { None });
@@ -170,7 +171,8 @@ impl Writer<'_, '_> {
     }
 }
 
-fn saved(mesh: u32, tree: &Tree, skipped: usize, gone: usize, sah_cost: f32) -> SavedTree {
+/// The record of a tree, without its SAH cost.
+fn saved(mesh: u32, tree: &Tree, skipped: usize, gone: usize, is_refitted: bool) -> SavedTree {
     let (nodes, leaves, is_compact) = match tree {
         Tree::Whole(t) => (t.nodes.len(), t.leaves.len(), 0),
         Tree::Compact(t) => (t.nodes.len(), t.triangles.len(), 1),
@@ -185,7 +187,7 @@ fn saved(mesh: u32, tree: &Tree, skipped: usize, gone: usize, sah_cost: f32) -> 
         gone: gone as u64,
         lower: lower.to_array(),
         upper: upper.to_array(),
-        sah_cost,
-        reserved: 0,
+        sah_cost: 0.0,
+        is_refitted: is_refitted.into(),
     }
 }

@@ -270,6 +270,9 @@ pub struct FileFlags {
     /// SCENE
     #[arg(long, value_name = "FILE", value_parser = values::scene_file)]
     pub save_scene: Option<PathBuf>,
+    /// Take over trees of FILE.bkscene where meshes are as they were there, instead of building them
+    #[arg(long, value_name = "FILE", value_parser = values::scene_file)]
+    pub trees_from: Option<PathBuf>,
     /// Read SCENE.bkscene to memory instead of mapping it
     #[arg(long)]
     pub read_scene: bool,
@@ -327,7 +330,8 @@ pub struct LightmapFlags {
     /// Keep unwraps in DIR by their content, so that parts that have not changed are not unwrapped again
     #[arg(long, value_name = "DIR")]
     pub cache: Option<PathBuf>,
-    /// Keep what charts have per triangle in files of this folder instead of memory, for scenes that are larger than it
+    /// Keep meshes, trees and what charts have per triangle in files of this folder instead of memory, for scenes that are
+    /// larger than it
     #[arg(long, value_name = "FOLDER")]
     pub scratch: Option<PathBuf>,
     /// Light map texels per gather map texel and axis

@@ -108,6 +108,7 @@ pub struct BakeArgs {
     pub max_texture_mb: u64,
     pub max_file_mb: u64,
     pub save_scene: Option<PathBuf>,
+    pub trees_from: Option<PathBuf>,
     pub read_scene: bool,
     pub ray_queues: bool,
     /// How often the scene stands beside itself, and whether as instances.
@@ -477,6 +478,7 @@ fn bake_args(f: Flags) -> Result<BakeArgs, String> {
         max_texture_mb: f.file.max_texture_mb,
         max_file_mb: f.file.max_file_mb,
         save_scene: f.file.save_scene,
+        trees_from: f.file.trees_from,
         read_scene: f.file.read_scene,
         ray_queues: f.file.ray_queues,
         repeat: f.file.repeat,
