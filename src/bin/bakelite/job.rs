@@ -143,10 +143,10 @@ impl<'a> Job<'a> {
         };
         let start = Instant::now();
         let commit = |p: &Progress| match &earlier {
-            Some(earlier) => Scene::commit_from(device, data, build, earlier, p),
-            None => Scene::commit(device, data, build, p),
+            Some(earlier) => Scene::commit_from(device, data, build, earlier, p).map_err(|(_, e)| e),
+            None => Scene::commit(device, data, build, p).map_err(|(_, e)| e),
         };
-        let scene = self.bars.show("scene", |p| commit(p).map_err(|(_, e)| e))?;
+        let scene = self.bars.show("scene", commit)?;
         if earlier.is_some() {
             let all: usize = scene.meshes().iter().map(|m| m.indices.len()).sum();
             let kept = scene.stats().kept_triangles;
