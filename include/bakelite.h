@@ -536,6 +536,8 @@ bk_result bk_scene_commit_from(bk_scene *scene,
 ///   be hit, or another thread queries or changes the scene; the positions wait for the next refit
 /// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses the copy; the positions wait for the
 ///   next refit
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder for the copy; the positions
+///   wait for the next refit
 BK_API
 bk_result bk_scene_refit(bk_scene *scene);
 
@@ -683,7 +685,8 @@ BK_API void bk_load_params_init(bk_load_params *params);
 /// @param params  limits; NULL for the defaults
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @param out  receives the numbers of the objects added; may be NULL
-/// @retval BK_ERROR_IO  a file cannot be read or is malformed; bk_last_error names it
+/// @retval BK_ERROR_IO  a file cannot be read or is malformed, and bk_last_error names it; or there
+///   is no room in bk_device_desc.scratch_folder
 /// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, the file requires an extension of
 ///   glTF that is not supported, or the library was built without files
 /// @retval BK_ERROR_OUT_OF_MEMORY  a limit of `params` is exceeded, the memory callback refuses, or
@@ -708,6 +711,7 @@ bk_result bk_scene_load_file(bk_scene *scene,
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such scene
 /// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
 BK_API bk_result bk_scene_load_builtin(bk_scene *scene, const char *name);
 
 /// Writes a committed scene to a file, which is replaced as a whole, for bk_scene_open: meshes,
@@ -1744,6 +1748,7 @@ BK_API void bk_lightmap_desc_init(bk_lightmap_desc *desc);
 /// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 /// @retval BK_ERROR_OUT_OF_MEMORY  there would be more than 2^29 texels, they do not fit, or the
 ///   memory callback refuses
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_API
 bk_result bk_lightmap_create(const bk_scene *scene,
@@ -1781,6 +1786,7 @@ bk_result bk_lightmap_create(const bk_scene *scene,
 ///   is changing the earlier light map
 /// @retval BK_ERROR_OUT_OF_MEMORY  there would be more than 2^29 texels, they do not fit, or the
 ///   memory callback refuses
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 BK_API
 bk_result bk_lightmap_create_from(const bk_scene *scene,

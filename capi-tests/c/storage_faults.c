@@ -218,6 +218,13 @@ static void resize_disk(const char *path, const char *bytes) {
 #endif
 }
 
+/* Shrinks or grows the disk so that so many megabytes are free. */
+static void leave_room(const char *path, long megabytes) {
+    char bytes[64];
+    snprintf(bytes, sizeof bytes, "%ldm", (used_on(path) >> 20) + megabytes);
+    resize_disk(path, bytes);
+}
+
 static void unmounted(const char *path) {
 #ifdef __linux__
     CHECK(umount(path) == 0);
@@ -233,11 +240,14 @@ static void scratch_files_on_a_full_disk(void) {
     bk_lightmap_desc desc;
     bk_bake_params params = quick(NULL);
     int unfinished;
-    /* Meshes and trees lie in them, too. What cannot be committed stays as it is. */
+    /* Meshes and trees lie in them, too. What cannot be loaded or committed stays as it is. */
     CHECK_OK(bk_scene_create(device, &scene));
-    CHECK_OK(bk_scene_load_builtin(scene, "hall:100000"));
-    CHECK_ERROR(bk_scene_commit(scene, NULL, NULL), IO, "scratch file");
+    CHECK_ERROR(bk_scene_load_builtin(scene, "hall:100000"), IO, "scratch file");
     mkdir(at("scratch"), 0755);
+    limit_files(1 << 20);
+    CHECK_ERROR(bk_scene_load_builtin(scene, "hall:100000"), IO, "scratch file");
+    limit_files(RLIM_INFINITY);
+    CHECK_OK(bk_scene_load_builtin(scene, "hall:100000"));
     limit_files(1 << 20);
     CHECK_ERROR(bk_scene_commit(scene, NULL, NULL), IO, "scratch file");
     limit_files(RLIM_INFINITY);
@@ -248,17 +258,18 @@ static void scratch_files_on_a_full_disk(void) {
     if (mounted(at("disk"), "30m")) {
         bk_device *small = device_with(at("disk"));
         bk_scene *hall = NULL;
-        char size[64];
         CHECK_OK(bk_scene_create(small, &hall));
-        CHECK_OK(bk_scene_load_builtin(hall, "hall:1000000"));
         /* There is room for some of what they need, at most. */
-        CHECK_ERROR(bk_scene_commit(hall, NULL, NULL), IO, "scratch file");
+        CHECK_ERROR(bk_scene_load_builtin(hall, "hall:1000000"), IO, "scratch file");
         CHECK(files_in(at("disk"), &unfinished) == 0);
         resize_disk(at("disk"), "250m");
+        CHECK_OK(bk_scene_load_builtin(hall, "hall:1000000"));
+        leave_room(at("disk"), 80);
+        CHECK_ERROR(bk_scene_commit(hall, NULL, NULL), IO, "scratch file");
+        resize_disk(at("disk"), "250m");
         CHECK_OK(bk_scene_commit(hall, NULL, NULL));
-        /* Room that the commit needed is free again: it goes, but for 20 MB. */
-        snprintf(size, sizeof size, "%ldm", (used_on(at("disk")) >> 20) + 20);
-        resize_disk(at("disk"), size);
+        /* Room that the commit needed is free again. */
+        leave_room(at("disk"), 20);
         CHECK_ERROR(bk_lightmap_create(hall, &desc, NULL, NULL, &lightmap), IO, "scratch file");
         CHECK(lightmap == NULL && files_in(at("disk"), &unfinished) == 0);
         resize_disk(at("disk"), "750m");

@@ -156,7 +156,8 @@ pub unsafe extern "C" fn bk_load_params_init(params: *mut bk_load_params) {
 /// @param params  limits; NULL for the defaults
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @param out  receives the numbers of the objects added; may be NULL
-/// @retval BK_ERROR_IO  a file cannot be read or is malformed; bk_last_error names it
+/// @retval BK_ERROR_IO  a file cannot be read or is malformed, and bk_last_error names it; or there
+///   is no room in bk_device_desc.scratch_folder
 /// @retval BK_ERROR_UNSUPPORTED  the kind of file is unknown, the file requires an extension of
 ///   glTF that is not supported, or the library was built without files
 /// @retval BK_ERROR_OUT_OF_MEMORY  a limit of `params` is exceeded, the memory callback refuses, or
@@ -267,6 +268,7 @@ fn load_file(
 /// @retval BK_ERROR_INVALID_ARGUMENT  there is no such scene
 /// @retval BK_ERROR_INVALID_STATE  the scene is committed or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_load_builtin(scene: *mut bk_scene, name: *const c_char) -> bk_result {
     call(|| {

@@ -148,6 +148,7 @@ pub unsafe extern "C" fn bk_lightmap_desc_init(desc: *mut bk_lightmap_desc) {
 /// @retval BK_ERROR_INVALID_STATE  the scene is not committed or is being refitted
 /// @retval BK_ERROR_OUT_OF_MEMORY  there would be more than 2^29 texels, they do not fit, or the
 ///   memory callback refuses
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_create(
@@ -199,6 +200,7 @@ pub unsafe extern "C" fn bk_lightmap_create(
 ///   is changing the earlier light map
 /// @retval BK_ERROR_OUT_OF_MEMORY  there would be more than 2^29 texels, they do not fit, or the
 ///   memory callback refuses
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
 /// @retval BK_ERROR_CANCELLED  the progress callback returned 0
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_lightmap_create_from(

@@ -440,6 +440,8 @@ pub unsafe extern "C" fn bk_scene_commit_from(
 ///   be hit, or another thread queries or changes the scene; the positions wait for the next refit
 /// @retval BK_ERROR_OUT_OF_MEMORY  the memory callback refuses the copy; the positions wait for the
 ///   next refit
+/// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder for the copy; the positions
+///   wait for the next refit
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn bk_scene_refit(scene: *mut bk_scene) -> bk_result {
     call(|| {
