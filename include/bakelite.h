@@ -475,8 +475,8 @@ BK_API bk_result bk_scene_set_build(bk_scene *scene, const bk_build_params *para
 ///
 /// @param scene  scene that is not committed
 /// @param progress,user  progress callback and its pointer; may be NULL
-/// @retval BK_ERROR_INVALID_STATE  the scene is committed already, has no usable triangle, or
-///   another thread is changing it
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed already, has no usable triangle or too many
+///   (bk_mesh_desc.triangle_count), or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the acceleration structure does not fit or the memory callback
 ///   refuses
 /// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
@@ -501,7 +501,7 @@ BK_API bk_result bk_scene_commit(bk_scene *scene, bk_progress_fn progress, void 
 ///   the call
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @retval BK_ERROR_INVALID_STATE  the scene is committed already, `earlier` is not, the scene has no
-///   usable triangle, or another thread is changing it
+///   usable triangle or too many, or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the acceleration structure does not fit or the memory callback
 ///   refuses
 /// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder, or the mapped file of
@@ -949,7 +949,8 @@ typedef struct bk_mesh_desc {
   size_t vertex_count;
   /// Three vertex numbers per triangle, packed, each less than `vertex_count`. Default: NULL.
   const uint32_t *indices;
-  /// Number of triangles; at most 2^28 in a scene. Default: 0.
+  /// Number of triangles; at most 2^28. All meshes without instances together have at most as many
+  /// when the scene is committed; those of all instances are at most 2^32 - 2. Default: 0.
   size_t triangle_count;
   /// `vertex_count` shading normals of three floats, unit vectors; may be NULL. Default: NULL,
   /// geometric normals.

@@ -172,7 +172,8 @@ pub struct bk_mesh_desc {
     pub vertex_count: usize,
     /// Three vertex numbers per triangle, packed, each less than `vertex_count`. Default: NULL.
     pub indices: *const u32,
-    /// Number of triangles; at most 2^28 in a scene. Default: 0.
+    /// Number of triangles; at most 2^28. All meshes without instances together have at most as many
+    /// when the scene is committed; those of all instances are at most 2^32 - 2. Default: 0.
     pub triangle_count: usize,
     /// `vertex_count` shading normals of three floats, unit vectors; may be NULL. Default: NULL,
     /// geometric normals.

@@ -357,8 +357,8 @@ pub unsafe extern "C" fn bk_scene_set_build(scene: *mut bk_scene, params: *const
 ///
 /// @param scene  scene that is not committed
 /// @param progress,user  progress callback and its pointer; may be NULL
-/// @retval BK_ERROR_INVALID_STATE  the scene is committed already, has no usable triangle, or
-///   another thread is changing it
+/// @retval BK_ERROR_INVALID_STATE  the scene is committed already, has no usable triangle or too many
+///   (bk_mesh_desc.triangle_count), or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the acceleration structure does not fit or the memory callback
 ///   refuses
 /// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder
@@ -395,7 +395,7 @@ pub unsafe extern "C" fn bk_scene_commit(
 ///   the call
 /// @param progress,user  progress callback and its pointer; may be NULL
 /// @retval BK_ERROR_INVALID_STATE  the scene is committed already, `earlier` is not, the scene has no
-///   usable triangle, or another thread is changing it
+///   usable triangle or too many, or another thread is changing it
 /// @retval BK_ERROR_OUT_OF_MEMORY  the acceleration structure does not fit or the memory callback
 ///   refuses
 /// @retval BK_ERROR_IO  there is no room in bk_device_desc.scratch_folder, or the mapped file of

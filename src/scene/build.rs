@@ -134,6 +134,7 @@ impl Scene {
         if total == 0 {
             return Err(Error::InvalidState("the scene has no triangles".into()));
         }
+        data.check_own_triangles()?;
         let stage = progress.stage("bvh", 0.0, 1.0, 1);
         let first_triangle = data.first_triangles()?;
         let own = data.own_triangles;
@@ -315,9 +316,9 @@ impl SceneData {
 mod tests {
     use super::*;
     use crate::device::DeviceOptions;
-    use crate::scene::{Light, MAX_ALBEDO, Mesh, Texture};
+    use crate::scene::{Instance, Light, MAX_ALBEDO, MAX_TRIANGLES, Mesh, Texture};
     use crate::trace::{Hit, Ray};
-    use glam::Vec2;
+    use glam::{Affine3A, Vec2};
 
     /// A floor (mesh 0), a lamp over it (mesh 1, emissive), and a triangle that is none (mesh 2).
     fn scene() -> Arc<Scene> {
@@ -354,6 +355,24 @@ mod tests {
         let expected = Vec3::new(MAX_ALBEDO, 0.215_861, 0.5 * 0.215_861);
         assert!((scene.albedo(0, 0.2, 0.3) - expected).abs().max_element() < 1e-6);
         assert_eq!(scene.albedo(1, 0.2, 0.3), Vec3::new(MAX_ALBEDO, MAX_ALBEDO, 0.5));
+    }
+
+    #[test]
+    fn large_meshes_without_instances_get_them_after_a_refused_commit() {
+        let device = Device::new(DeviceOptions { num_threads: 1, ..Default::default() }).unwrap();
+        let mut data = SceneData::new();
+        data.add_material(Material::default()).unwrap();
+        data.add_mesh(Mesh { positions: FLOOR.to_vec().into(), indices: vec![[0, 1, 2]].into(), ..Default::default() })
+            .unwrap();
+        // As if another mesh had so many; they do not fit into memory here.
+        data.own_triangles += MAX_TRIANGLES;
+        let commit = |data| Scene::commit(&device, data, &BuildOptions::default(), &Progress::none()).map_err(Box::new);
+        let (mut data, e) = *commit(data).err().unwrap();
+        let message = "have 268435457 triangles together, more than 268435456: give the large ones an instance each";
+        assert!(matches!(&e, Error::InvalidState(m) if m.contains(message)), "{e}");
+        data.add_instance(Instance::new(0, Affine3A::IDENTITY)).unwrap();
+        assert_eq!(data.own_triangles, MAX_TRIANGLES);
+        data.check_own_triangles().unwrap();
     }
 
     #[test]

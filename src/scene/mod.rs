@@ -40,7 +40,8 @@ use crate::base::scratch_files::Storage;
 use std::borrow::Cow;
 use std::sync::Arc;
 
-/// Maximum number of triangles in a mesh, and in all meshes without instances together: leaf references hold 28 bits.
+/// Maximum number of triangles in a mesh, and in all meshes without instances of a committed scene together: leaf
+/// references hold 28 bits.
 pub const MAX_TRIANGLES: usize = 1 << 28;
 
 /// Maximum number of instances: the boxes of instances are leaves, too.
@@ -101,7 +102,7 @@ impl SceneData {
         mesh.validate(self.materials.len())?;
         mesh.shrink_to_fit();
         let own = self.own_triangles + mesh.indices.len();
-        self.check_triangles(own, self.instance_triangles)?;
+        Self::check_triangles(own, self.instance_triangles)?;
         self.own_triangles = own;
         self.meshes.push(mesh);
         Ok(self.meshes.len() as u32 - 1)
@@ -117,7 +118,7 @@ impl SceneData {
         let mesh = instance.mesh as usize;
         let triangles = self.meshes[mesh].indices.len();
         let own = self.own_triangles - if self.is_instanced(instance.mesh) { 0 } else { triangles };
-        self.check_triangles(own, self.instance_triangles + triangles)?;
+        Self::check_triangles(own, self.instance_triangles + triangles)?;
         Self::check_instances(self.meshes.len(), self.instances.len() + 1)?;
         let more = (mesh + 1).saturating_sub(self.has_instances.len());
         if self.has_instances.try_reserve(more).is_err() {
@@ -199,7 +200,7 @@ impl SceneData {
     pub fn append(&mut self, mut other: SceneData) -> Result<()> {
         let (own, placed) =
             (self.own_triangles + other.own_triangles, self.instance_triangles + other.instance_triangles);
-        self.check_triangles(own, placed)?;
+        Self::check_triangles(own, placed)?;
         Self::check_instances(self.meshes.len() + other.meshes.len(), self.instances.len() + other.instances.len())?;
         (self.own_triangles, self.instance_triangles) = (own, placed);
         let shift = self.materials.len() as u32;
@@ -391,15 +392,23 @@ impl SceneData {
     }
 
     /// Checks numbers of triangles of meshes without instances and of instances.
-    fn check_triangles(&self, own: usize, of_instances: usize) -> Result<()> {
-        if own > MAX_TRIANGLES {
-            return invalid_argument!(
-                "the scene would have {own} triangles without instances, more than {MAX_TRIANGLES}"
-            );
-        }
-        if own + of_instances > MAX_PLACED_TRIANGLES {
-            let total = own + of_instances;
+    fn check_triangles(own: usize, of_instances: usize) -> Result<()> {
+        let total = own + of_instances;
+        if total > MAX_PLACED_TRIANGLES {
             return invalid_argument!("the scene would have {total} triangles, more than {MAX_PLACED_TRIANGLES}");
+        }
+        Ok(())
+    }
+
+    /// Checks the number of triangles of all meshes without instances, which have one tree. Only a whole scene can be
+    /// checked, as each mesh is without instances until its first one is added.
+    fn check_own_triangles(&self) -> Result<()> {
+        let own = self.own_triangles;
+        if own > MAX_TRIANGLES {
+            return Err(Error::InvalidState(format!(
+                "the meshes without instances have {own} triangles together, more than {MAX_TRIANGLES}: give the large ones \
+                 an instance each"
+            )));
         }
         Ok(())
     }

@@ -7,8 +7,8 @@ use crate::scene::camera::Camera;
 use crate::scene::light::Light;
 use crate::scene::material::Material;
 use crate::scene::mesh::Mesh;
-use crate::scene::{MAX_TRIANGLES, SceneData};
-use glam::{UVec3, Vec3};
+use crate::scene::{Instance, MAX_TRIANGLES, SceneData};
+use glam::{Affine3A, UVec3, Vec3};
 use std::f32::consts::TAU;
 
 /// Length, height and width in metres.
@@ -23,11 +23,22 @@ const FLUTES: u32 = 24;
 /// Minimum number of triangles: flutes have one at least.
 const MIN_TRIANGLES: usize = 20_000;
 
-/// Makes a hall of about `triangles` triangles: mesh 0 is the room, the others are the columns.
+/// Maximum number of triangles: half of them are one mesh.
+const MAX_HALL: usize = 2 * MAX_TRIANGLES;
+
+/// Makes a hall of about `triangles` triangles: mesh 0 is the room, the others are the columns. Where they are too many for
+/// one tree, each mesh has one of its own, as an instance where it is.
 pub(super) fn hall(triangles: usize) -> Result<SceneData> {
-    if !(MIN_TRIANGLES..=MAX_TRIANGLES).contains(&triangles) {
-        return invalid_argument!("a hall of {triangles} triangles, not of {MIN_TRIANGLES} to {MAX_TRIANGLES}");
+    if !(MIN_TRIANGLES..=MAX_HALL).contains(&triangles) {
+        return invalid_argument!("a hall of {triangles} triangles, not of {MIN_TRIANGLES} to {MAX_HALL}");
     }
+    let add = |scene: &mut SceneData, mesh: Mesh| -> Result<()> {
+        let mesh = scene.add_mesh(mesh)?;
+        if triangles > MAX_TRIANGLES {
+            scene.add_instance(Instance { mesh, transform: Affine3A::IDENTITY, light_of: None })?;
+        }
+        Ok(())
+    };
     let mut scene = SceneData::new();
     let plaster = scene.add_material(Material { albedo: [0.7, 0.67, 0.6], ..Default::default() })?;
     let stone = scene.add_material(Material { albedo: [0.6, 0.55, 0.48], ..Default::default() })?;
@@ -41,13 +52,13 @@ pub(super) fn hall(triangles: usize) -> Result<SceneData> {
         }
         place
     };
-    scene.add_mesh(room((SIZE * per_metre).to_array(), plaster, place)?)?;
+    add(&mut scene, room((SIZE * per_metre).to_array(), plaster, place)?)?;
 
     let of_column = (triangles - scene.triangle_count()) / (COLUMNS[0] * COLUMNS[1]) as usize;
     for row in 0..COLUMNS[1] {
         for n in 0..COLUMNS[0] {
             let foot = Vec3::new(4.0 * (n + 1) as f32, 0.0, 6.0 + 8.0 * row as f32);
-            scene.add_mesh(column(of_column, foot, stone)?)?;
+            add(&mut scene, column(of_column, foot, stone)?)?;
         }
     }
     for x in [8.0, 16.0, 24.0, 32.0] {

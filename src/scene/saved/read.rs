@@ -181,7 +181,7 @@ impl File {
 
     fn scene(mut self, device: &Arc<Device>, path: &Path, start: Instant) -> Result<Scene> {
         let what = |e: Error| match e {
-            Error::InvalidArgument(e) => damaged(path, &e),
+            Error::InvalidArgument(e) | Error::InvalidState(e) => damaged(path, &e),
             e => e,
         };
         let missing = || damaged(path, "the lengths of its sections do not fit");
@@ -281,6 +281,7 @@ impl File {
             }
             *last = light;
         }
+        data.check_own_triangles()?;
         Ok(Some(data))
     }
 
