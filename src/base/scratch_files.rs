@@ -6,10 +6,11 @@ use super::error::{Error, Result};
 use super::memory::try_zeroed;
 use super::parallel::ParallelLoop;
 use super::progress::Progress;
-use bytemuck::Pod;
+use bytemuck::{Pod, cast_slice, cast_slice_mut};
 use memmap2::MmapMut;
 use rayon::prelude::*;
 use std::fs::{File, OpenOptions};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -51,15 +52,10 @@ impl<'a> Storage<'a> {
     /// Copies the elements of an array, on the current threads.
     pub fn copy<T: Pod + Send + Sync>(self, values: &Array<T>, what: &str, progress: &Progress) -> Result<Array<T>> {
         let mut copy = self.zeroed(values.len(), try_zeroed, what)?;
-        let part = (PART / size_of::<T>().max(1)).max(1);
-        let parts = copy.par_chunks_mut(part).zip(values.par_chunks(part)).enumerate();
-        parts.try_each(|(i, (to, from))| {
-            progress.check()?;
-            // (What was said to be read here and there would come page by page.)
-            values.will_need(i * part..i * part + from.len());
-            to.copy_from_slice(from);
-            Ok(())
-        })?;
+        let size = size_of::<T>().max(1);
+        // (What was said to be read here and there would come page by page.)
+        let will_need = |bytes: Range<usize>| values.will_need(bytes.start / size..bytes.end.div_ceil(size));
+        copy_bytes(cast_slice_mut(&mut copy), cast_slice(values), &will_need, progress)?;
         Ok(copy)
     }
 
@@ -74,6 +70,22 @@ impl<'a> Storage<'a> {
 
 /// Size in bytes of what is copied between two looks for a cancel.
 const PART: usize = 4 << 20;
+
+/// Copies bytes, whose ranges are announced to `will_need` before they are read. (Once for elements of all kinds: the
+/// loop would be in the library ten times.)
+fn copy_bytes(
+    to: &mut [u8],
+    from: &[u8],
+    will_need: &(dyn Fn(Range<usize>) + Sync),
+    progress: &Progress,
+) -> Result<()> {
+    to.par_chunks_mut(PART).zip(from.par_chunks(PART)).enumerate().try_each(|(i, (to, from))| {
+        progress.check()?;
+        will_need(i * PART..i * PART + from.len());
+        to.copy_from_slice(from);
+        Ok(())
+    })
+}
 
 /// Arrays in files of a folder.
 pub(crate) struct ScratchFiles {
@@ -94,15 +106,21 @@ impl ScratchFiles {
 
     /// Makes an array of zeros. A file goes when all arrays in it are gone, but the one that is being filled stays.
     pub fn zeroed<T: Pod>(&self, len: usize) -> Result<Array<T>> {
-        let Some(bytes) = len.checked_mul(size_of::<T>()).filter(|&bytes| bytes <= isize::MAX as usize - SHARED) else {
-            return Err(Error::OutOfMemory(format!("an array of {len} elements is too large for a scratch file")));
+        let (map, offset) = match len.checked_mul(size_of::<T>()) {
+            Some(0) => return Ok(Array::default()),
+            bytes => self.place(bytes)?,
         };
-        if bytes == 0 {
-            return Ok(Array::default());
-        }
-        let (map, offset) = if bytes > LARGEST_IN_SHARED { (self.file(bytes)?, 0) } else { self.part(bytes)? };
         // SAFETY: all bits are elements, and no other array gets this part of the file.
         Ok(unsafe { Array::mapped(&map, offset, len) }.expect("it lies in the file, at a multiple of ALIGN"))
+    }
+
+    /// Finds a place for so many bytes; none is more than there can be.
+    fn place(&self, bytes: Option<usize>) -> Result<(Arc<Mapping>, usize)> {
+        match bytes {
+            Some(bytes) if bytes <= LARGEST_IN_SHARED => self.part(bytes),
+            Some(bytes) if bytes <= isize::MAX as usize - SHARED => Ok((self.file(bytes)?, 0)),
+            _ => Err(Error::OutOfMemory("an array is too large for a scratch file".into())),
+        }
     }
 
     /// Takes a part of the file that is being filled.
