@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Bakes with 1, 2 and 4 ranks, with a rank that is killed while photons are traced or texels baked, and once more after all
-# were killed: the pages must have the same bits.
+# were killed, or the bake was cancelled: the pages must have the same bits.
 #
 #     capi-tests/mpi.sh BAKE_MPI FOLDER
 set -euo pipefail
@@ -77,6 +77,20 @@ wait_for_file "$out/lost/radiance-2-of-3.bkshare"
 kill -9 "$victim"
 wait $running || true
 must_be_whole lost
+
+# A bake is cancelled: all ranks end soon, no page is written, and the next one goes on.
+mkdir "$out/cancelled"
+ranks cancelled 3 60 &
+running=$!
+wait_for_file "$out/cancelled/photons-1-of-3.bkshare"
+touch "$out/cancelled/cancel"
+wait $running || true
+grep -q 'cancelled; what is in the folder is kept' "$out/cancelled.txt" || { cat "$out/cancelled.txt"; exit 1; }
+grep -q ' % of all ranks' "$out/cancelled.txt" || { echo 'no progress was printed'; cat "$out/cancelled.txt"; exit 1; }
+[ ! -e "$out/cancelled/page0-combined.exr" ] || { echo 'a cancelled bake wrote pages'; exit 1; }
+rm "$out/cancelled/cancel"
+ranks cancelled 3 60
+same whole cancelled
 
 # Begun anew after an interruption, a bake goes on with what is missing; a damaged share is made again.
 mkdir "$out/again"

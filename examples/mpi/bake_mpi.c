@@ -11,6 +11,8 @@
  * texels to FOLDER/part-K-of-N.light. When all are there, rank 0 writes pages to FOLDER/page...exr, which have the bits of
  * a bake on one machine.
  *
+ * Rank 0 prints how far all ranks are. A file FOLDER/cancel, made by anybody, cancels the bake within a second or so on all
+ * ranks, which end with code 3 (mpirun with 0 where it lets ranks be lost).
  * What is in the folder is not computed again: started anew after an interruption, the bake goes on with what is missing.
  * A rank that is lost (its beat stands still for STALL seconds) is replaced by rank 0, if mpirun lets the others go on
  * (Open MPI: --enable-recovery). See docs/guide.md, "Results, shards and checkpoints".
@@ -26,12 +28,13 @@
 /* Seconds without a sign of life after which a rank counts as lost; the environment variable BAKE_MPI_STALL. */
 static double stall = 30.0;
 
-enum { BEAT, STATE, CELLS }; /* what rank 0 keeps of each rank */
+enum { BEAT, STATE, DONE, CELLS }; /* what rank 0 keeps of each rank; DONE is thousandths of the present call */
 enum { WORKING, LAID_OUT, PHOTONS, RADIANCE, TEXELS, ENDED, ENDED_WITHOUT_SOME };
 
 static MPI_Win board;
 static int rank, size;
 static int *is_lost; /* of each rank, as far as rank 0 knows */
+static char cancel_name[4096];
 
 static void tell(int cell, int value)
 {
@@ -40,22 +43,77 @@ static void tell(int cell, int value)
     MPI_Win_unlock(0, board);
 }
 
-/* A sign of life, twice a second at most. Called by the thread that called the library. */
+static void read_cells(int other, int *cells)
+{
+    MPI_Win_lock(MPI_LOCK_SHARED, 0, 0, board);
+    MPI_Get_accumulate(NULL, 0, MPI_INT, cells, CELLS, MPI_INT, 0, CELLS * other, CELLS, MPI_INT, MPI_NO_OP, board);
+    MPI_Win_unlock(0, board);
+}
+
+static int is_cancelled(void)
+{
+    FILE *file = fopen(cancel_name, "rb");
+    if (file) {
+        fclose(file);
+    }
+    return file != NULL;
+}
+
+/* Prints how far the ranks are with a stage, every two seconds at most. */
+static void print_progress(const char *name, int stage)
+{
+    static double last = -1e9;
+    double now = MPI_Wtime(), done = 0.0;
+    int other;
+    if (rank != 0 || now - last < 2.0) {
+        return;
+    }
+    last = now;
+    for (other = 0; other < size; other++) {
+        int cells[CELLS];
+        read_cells(other, cells);
+        done += cells[STATE] >= stage ? 1.0 : cells[STATE] == stage - 1 ? 1e-3 * cells[DONE] : 0.0;
+    }
+    printf("%s: %.0f %% of all ranks\n", name, 100.0 * done / size);
+    fflush(stdout);
+}
+
+static int stage_now = LAID_OUT;
+
+static const char *stage_name(int stage)
+{
+    return stage == PHOTONS ? "photons" : stage == RADIANCE ? "radiance map" : stage == TEXELS ? "texels" : "layout";
+}
+
+/* A sign of life and a look for a cancel, twice a second at most. Called by the thread that called the library. */
 static int32_t progress(void *user, float fraction, const char *stage)
 {
-    static double last;
+    static double last = -1e9;
     double now = MPI_Wtime();
-    (void)user, (void)fraction, (void)stage;
+    (void)user, (void)stage;
     if (now - last > 0.5) {
         last = now;
         tell(BEAT, 1);
+        tell(DONE, (int)(1000.0f * fraction));
+        print_progress(stage_name(stage_now), stage_now);
+        return !is_cancelled();
     }
     return 1;
 }
 
+/* Ends all ranks. Files are replaced as a whole, so that what is in the folder is whole. */
+static void end_cancelled(void)
+{
+    printf("rank %d: cancelled; what is in the folder is kept\n", rank);
+    fflush(stdout);
+    MPI_Abort(MPI_COMM_WORLD, 3);
+}
+
 static void check(bk_result result, const char *what)
 {
-    if (result != BK_OK) {
+    if (result == BK_ERROR_CANCELLED) {
+        end_cancelled();
+    } else if (result != BK_OK) {
         fprintf(stderr, "rank %d: %s: %s\n", rank, what, bk_last_error());
         MPI_Abort(MPI_COMM_WORLD, 1);
     }
@@ -118,9 +176,7 @@ static int wait_for(int other, int state)
     int cells[CELLS], beat = -1;
     double since = MPI_Wtime();
     for (;;) {
-        MPI_Win_lock(MPI_LOCK_SHARED, 0, 0, board);
-        MPI_Get_accumulate(NULL, 0, MPI_INT, cells, CELLS, MPI_INT, 0, CELLS * other, CELLS, MPI_INT, MPI_NO_OP, board);
-        MPI_Win_unlock(0, board);
+        read_cells(other, cells);
         if (cells[STATE] >= state) {
             return cells[STATE];
         }
@@ -129,6 +185,10 @@ static int wait_for(int other, int state)
             since = MPI_Wtime();
         } else if (MPI_Wtime() - since > stall) {
             return WORKING;
+        }
+        print_progress(stage_name(state), state);
+        if (is_cancelled()) {
+            end_cancelled();
         }
         nanosleep(&pause, NULL);
     }
@@ -141,6 +201,8 @@ static void do_stage(int stage, bk_lightmap *map, const char *folder)
     double begin = MPI_Wtime(), own;
     clock_t processor = clock();
     int part;
+    stage_now = stage;
+    tell(DONE, 0);
     do_part(stage, map, folder, rank);
     own = MPI_Wtime() - begin;
     processor = clock() - processor;
@@ -162,8 +224,7 @@ static void do_stage(int stage, bk_lightmap *map, const char *folder)
         wait_for(0, stage);
     }
     printf("rank %d: %s %.2f s (%.2f s of processors), then waited or helped %.2f s\n", rank,
-           stage == PHOTONS ? "photons" : stage == RADIANCE ? "radiance map" : "texels", own,
-           (double)processor / CLOCKS_PER_SEC, MPI_Wtime() - begin - own);
+           stage_name(stage), own, (double)processor / CLOCKS_PER_SEC, MPI_Wtime() - begin - own);
 }
 
 static bk_scene *load(bk_device *device, const char *name)
@@ -211,6 +272,7 @@ int main(int argc, char **argv)
     if (getenv("BAKE_MPI_STALL")) {
         stall = atof(getenv("BAKE_MPI_STALL"));
     }
+    snprintf(cancel_name, sizeof cancel_name, "%s/cancel", argv[1]);
     is_lost = calloc((size_t)size, sizeof *is_lost);
     if (!is_lost) {
         MPI_Abort(MPI_COMM_WORLD, 1);
