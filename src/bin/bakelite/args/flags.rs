@@ -203,6 +203,10 @@ pub struct ScalingFlags {
     /// Measure trees and rays alone, and no light maps
     #[arg(long, help_heading = "Report scaling")]
     pub rays_only: bool,
+    /// Bake each scene with these texels per unit, one after another, to measure growth with texels
+    #[arg(long, value_name = "A,B,..", help_heading = "Report scaling", value_delimiter = ',',
+        value_parser = of(|d: &mut LightmapDesc, v| d.texels_per_unit = v), conflicts_with = "rays_only")]
+    pub densities: Vec<f32>,
     #[command(flatten)]
     pub flags: Flags,
 }

@@ -212,6 +212,8 @@ pub struct ReportArgs {
     pub scenes: Vec<String>,
     /// Scaling: whether light maps are left out.
     pub rays_only: bool,
+    /// Scaling: texels per unit with which each scene is baked, instead of the one of the light map.
+    pub densities: Vec<f32>,
 }
 
 /// Light map texels per metre of the atrium unless a density is given: it takes so many to show the
@@ -352,8 +354,9 @@ fn command_of(line: CommandLine, is_given: &dyn Fn(&str) -> bool) -> Result<Comm
             Command::ReportCoherence(Box::new(ReportArgs { scenes, ..report_args(coherence.flags)? }))
         }
         Verb::Report(Report::Scaling(scaling)) => {
-            let (scenes, rays_only) = (scaling.scenes, scaling.rays_only);
-            Command::ReportScaling(Box::new(ReportArgs { scenes, rays_only, ..report_args(scaling.flags)? }))
+            let (scenes, rays_only, densities) = (scaling.scenes, scaling.rays_only, scaling.densities);
+            let flags = report_args(scaling.flags)?;
+            Command::ReportScaling(Box::new(ReportArgs { scenes, rays_only, densities, ..flags }))
         }
         Verb::Report(Report::Quality(quality)) => Command::ReportQuality(Box::new(ReportArgs {
             points: quality.points as usize,
@@ -389,6 +392,7 @@ fn report_args(flags: Flags) -> Result<ReportArgs, String> {
         knobs: Vec::new(),
         scenes: Vec::new(),
         rays_only: false,
+        densities: Vec::new(),
     })
 }
 

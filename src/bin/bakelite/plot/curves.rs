@@ -17,6 +17,8 @@ pub struct Plot<'a> {
     pub x_label: &'a str,
     pub y_label: &'a str,
     pub series: Vec<Series<'a>>,
+    /// Values of x with a dashed line and a name. Those beyond the curves are left out.
+    pub marks: Vec<(f64, String)>,
 }
 
 const WIDTH: f64 = 720.0;
@@ -65,6 +67,16 @@ impl Plot<'_> {
              font-size=\"12\">\n<rect width=\"{WIDTH}\" height=\"{HEIGHT}\" fill=\"white\"/>\n"
         );
         grid(&mut out, &x, &y);
+        let is_shown = |value: f64| (x.from..=x.to).contains(&x.at(value));
+        for (value, name) in self.marks.iter().filter(|m| m.0 > 0.0 && is_shown(m.0)) {
+            let (at, [low, high]) = (x.at(*value), [y.from, y.to]);
+            let _ = writeln!(
+                out,
+                "<line x1=\"{at:.1}\" y1=\"{low:.1}\" x2=\"{at:.1}\" y2=\"{high:.1}\" stroke=\"#606060\" \
+                 stroke-dasharray=\"5 4\"/>"
+            );
+            text(&mut out, [at + 4.0, y.from - 6.0], "start", "", name);
+        }
         let middle = [(x.from + x.to) / 2.0, (y.from + y.to) / 2.0];
         text(&mut out, [middle[0], 24.0], "middle", "font-size=\"15\"", self.title);
         text(&mut out, [middle[0], HEIGHT - 14.0], "middle", "", self.x_label);
@@ -143,7 +155,15 @@ mod tests {
     fn what_has_no_logarithm_is_left_out() {
         let points = vec![[0.0, 1.0], [1.0, 0.0], [f64::NAN, 1.0], [2.0, 0.5], [3.0, 0.25]];
         let series = vec![Series { name: "a < b", points }];
-        let svg = Plot { title: "t & u", x_label: "x", y_label: "y", series }.svg();
+        let svg = Plot {
+            title: "t & u",
+            x_label: "x",
+            y_label: "y",
+            series,
+            marks: vec![(2.5, "m & n".into()), (1e9, "far".into())],
+        }
+        .svg();
+        assert!(svg.contains("m &amp; n") && svg.matches("dasharray").count() == 1 && !svg.contains("far"));
         // Two points of the curve and two in the legend.
         assert_eq!(svg.matches("<circle").count(), 4);
         assert!(svg.contains("a &lt; b") && svg.contains("t &amp; u") && !svg.contains("NaN") && !svg.contains("inf"));

@@ -1,6 +1,6 @@
 //! `bakelite report coherence`: rates of rays by tree, way and coherence against the number of triangles, with the exponents of
 //! the powers that fit them: the study of the thesis's Appendix A, which has 13·x^(1/8), 8.9·x^(1/7), 2.7·x^(1/5) and
-//! 36.6·x^(1/8) for its four kernels.
+//! 36.6·x^(1/8) for its four kernels. Plots have a line where a scene is as large as a cache.
 
 use crate::args::{BakeArgs, ReportArgs};
 use crate::files;
@@ -52,7 +52,8 @@ struct Trees<'a> {
 /// `--threads` asks for more.
 pub fn run(args: &ReportArgs) -> Result<()> {
     files::make_folder(&args.bake.out)?;
-    println!("caches of a core: {}; {} threads\n", caches(), args.bake.threads.max(1));
+    let caches: Vec<String> = caches().iter().map(|c| format!("L{} {} {}", c.level, c.kind, c.size)).collect();
+    println!("caches of a core: {}; {} threads\n", caches.join(", "), args.bake.threads.max(1));
     let mut names: Vec<String> = Vec::new();
     let mut rows: Vec<(f64, f64, Vec<Vec<f64>>)> = Vec::new();
     for name in &args.scenes {
@@ -81,8 +82,9 @@ pub fn run(args: &ReportArgs) -> Result<()> {
         let exponents: Vec<String> = exponents.map(|e| e.map_or(String::new(), |e| format!("{e:+.3}"))).collect();
         println!("| exponent | | {} |\n", exponents.join(" | "));
         let series = names.iter().enumerate().map(|(kind, name)| Series { name, points: points(way, kind) });
-        let plot =
-            Plot { title: name, x_label: "triangles", y_label: "million rays per second", series: series.collect() };
+        let (x_label, y_label) = ("triangles", "million rays per second");
+        let marks = marks(&rows.iter().map(|row| [row.0, row.1]).collect::<Vec<_>>());
+        let plot = Plot { title: name, x_label, y_label, series: series.collect(), marks };
         files::write_text(&args.bake.out.join(format!("coherence-{way}.svg")), &plot.svg())?;
     }
     let mut csv = format!("triangles,bytes,way,{}\n", names.join(","));
@@ -185,13 +187,44 @@ impl Trees<'_> {
     }
 }
 
-/// Sizes of the first core's caches as the system knows them.
-fn caches() -> String {
+/// Triangles with which a scene is as large as each cache that holds data, by the two scenes (triangles, bytes) whose sizes
+/// are next to it.
+fn marks(scenes: &[[f64; 2]]) -> Vec<(f64, String)> {
+    let mut scenes = scenes.to_vec();
+    scenes.sort_by(|a, b| a[1].total_cmp(&b[1]));
+    let triangles = |bytes: f64| {
+        let [a, b] = scenes.windows(2).map(|w| [w[0], w[1]]).find(|w| (w[0][1]..=w[1][1]).contains(&bytes))?;
+        let part = (bytes / a[1]).ln() / (b[1] / a[1]).ln();
+        Some(a[0] * (b[0] / a[0]).powf(part))
+    };
+    let of_data = caches().into_iter().filter(|cache| cache.kind != "Instruction");
+    of_data.filter_map(|cache| Some((triangles(cache.bytes()?)?, format!("L{} {}", cache.level, cache.size)))).collect()
+}
+
+/// A cache of the first core as the system knows it: kind "Data", "Instruction" or "Unified", size as "32K".
+struct Cache {
+    level: String,
+    kind: String,
+    size: String,
+}
+
+impl Cache {
+    fn bytes(&self) -> Option<f64> {
+        let (number, factor) = match (self.size.strip_suffix('K'), self.size.strip_suffix('M')) {
+            (Some(number), _) => (number, 1024.0),
+            (_, Some(number)) => (number, 1024.0 * 1024.0),
+            _ => (&self.size[..], 1.0),
+        };
+        number.parse::<f64>().ok().map(|number| factor * number)
+    }
+}
+
+fn caches() -> Vec<Cache> {
     let read = |index: u32, what: &str| {
         let path = format!("/sys/devices/system/cpu/cpu0/cache/index{index}/{what}");
         std::fs::read_to_string(path).ok().map(|text| text.trim().to_owned())
     };
-    let all = (0..4).map_while(|i| Some(format!("L{} {} {}", read(i, "level")?, read(i, "type")?, read(i, "size")?)));
-    let all: Vec<String> = all.collect();
-    if all.is_empty() { "unknown".into() } else { all.join(", ") }
+    (0..4)
+        .map_while(|i| Some(Cache { level: read(i, "level")?, kind: read(i, "type")?, size: read(i, "size")? }))
+        .collect()
 }

@@ -12,6 +12,9 @@ use std::time::Instant;
 /// Rays that are timed together.
 const RAYS: u32 = 100_000;
 
+/// Rays from each point, of streams.
+const RAYS_PER_POINT: u32 = 256;
+
 /// Times that each tree traces them, by turns.
 const PAIRS: usize = 9;
 
@@ -25,17 +28,19 @@ pub fn run(args: &BakeArgs) -> Result<()> {
         job.commit_on(&device, data.clone(), &BuildOptions { compact, ..args.build })
     };
     let scenes = [commit(false)?, commit(true)?];
-    let rays = surface_rays(&scenes[0], RAYS, 1);
-    let ratios = rates(&scenes, &rays)?;
+    let [random, streams] = [1, RAYS_PER_POINT].map(|per_point| surface_rays(&scenes[0], RAYS, per_point));
+    let [random, occluded] = rates(&scenes, &random)?;
+    let [streams, streams_occluded] = rates(&scenes, &streams)?;
     let [default, compact] = scenes.each_ref().map(|s| bytes(s));
     let both = |i: usize| format!("{:.1} / {:.1}", default[i], compact[i]);
     let (nodes, leaves, sum, peak) = (both(0), both(1), both(5), both(6));
     let [positions, indices, others] = [2, 3, 4].map(|i| format!("{:.1}", default[i]));
-    let [random, occluded] = ratios.map(|r| format!("{r:.2}"));
-    println!("| scene | nodes | leaves | positions | indices | others | sum | while building | random | occluded |");
-    println!("|---|---|---|---|---|---|---|---|---|---|");
+    let ratios = [random, occluded, streams, streams_occluded].map(|r| format!("{r:.2}")).join(" | ");
+    print!("| scene | nodes | leaves | positions | indices | others | sum | while building ");
+    println!("| random | occluded | streams of {RAYS_PER_POINT} | occluded |");
+    println!("|{}", "---|".repeat(12));
     println!(
-        "| {} | {nodes} | {leaves} | {positions} | {indices} | {others} | {sum} | {peak} | {random} | {occluded} |",
+        "| {} | {nodes} | {leaves} | {positions} | {indices} | {others} | {sum} | {peak} | {ratios} |",
         args.scene
     );
     Ok(())

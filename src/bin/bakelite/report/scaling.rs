@@ -1,5 +1,5 @@
 //! `bakelite report scaling`: seconds and bytes of the stages of a bake, and rates of rays, against the number of
-//! triangles, with the exponents of the powers that fit them (least squares of logarithms).
+//! triangles, or with `--densities` against that of texels, with the exponents of the powers that fit them (least squares of logarithms).
 //!
 //! The thesis's Appendix A fitted 13·x^(1/8), 8.9·x^(1/7), 2.7·x^(1/5) and 36.6·x^(1/8) for its four kernels.
 
@@ -9,7 +9,7 @@ use crate::job::Job;
 use crate::pictures::PrimaryRays;
 use crate::plot::curves::{Plot, Series};
 use crate::report::measure::{exponent, median, surface_rays};
-use bakelite::lightmap::Lightmap;
+use bakelite::lightmap::{Lightmap, LightmapDesc};
 use bakelite::scene::builtin_camera;
 use bakelite::trace::{Hit, Ray};
 use bakelite::{Result, Scene};
@@ -39,6 +39,8 @@ struct Row {
     scene: String,
     triangles: f64,
     texels: u64,
+    /// The one of them that grows.
+    x: f64,
     seconds: [f64; STAGES.len()],
     /// Announced per triangle: what the scene holds, and at most while it is built; the same of the light map; at most
     /// while it is baked.
@@ -51,8 +53,17 @@ struct Row {
 pub fn run(args: &ReportArgs) -> Result<()> {
     files::make_folder(&args.bake.out)?;
     let mut rows = Vec::new();
+    let by_texels = !args.densities.is_empty();
     for scene in &args.scenes {
-        rows.push(measure(&BakeArgs { scene: scene.clone(), ..args.bake.clone() }, args.rays_only)?);
+        let of_scene = BakeArgs { scene: scene.clone(), ..args.bake.clone() };
+        if !by_texels {
+            rows.push(measure(&of_scene, args.rays_only)?);
+        }
+        for &texels_per_unit in &args.densities {
+            let desc = LightmapDesc { texels_per_unit, ..of_scene.desc.clone() };
+            let row = measure(&BakeArgs { desc, ..of_scene.clone() }, false)?;
+            rows.push(Row { x: row.texels as f64, ..row });
+        }
     }
     table("seconds", &STAGES, &rows, |r| &r.seconds);
     table("bytes per triangle", &BYTES, &rows, |r| &r.bytes);
@@ -61,7 +72,8 @@ pub fn run(args: &ReportArgs) -> Result<()> {
     files::write_text(&path("scaling.csv"), &csv(&rows))?;
     let plot = |file: &str, y_label, names: &[&str], of: fn(&Row) -> &[f64]| {
         let series = names.iter().enumerate().map(|(i, &name)| Series { name, points: points(&rows, i, of) });
-        let plot = Plot { title: "Scaling", x_label: "triangles", y_label, series: series.collect() };
+        let x_label = if by_texels { "texels" } else { "triangles" };
+        let plot = Plot { title: "Scaling", x_label, y_label, series: series.collect(), marks: Vec::new() };
         files::write_text(&path(file), &plot.svg())
     };
     plot("scaling-seconds.svg", "seconds", &STAGES, |r| &r.seconds)?;
@@ -82,6 +94,7 @@ fn measure(args: &BakeArgs, rays_only: bool) -> Result<Row> {
         scene: args.title(),
         triangles,
         texels: 0,
+        x: triangles,
         seconds: [tree, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, tree],
         bytes: [scene.stats().bytes as i64, building, 0, 0, 0].map(|bytes| bytes as f64 / triangles),
         rates,
@@ -142,7 +155,7 @@ fn rate(rays: usize, mut trace: impl FnMut() -> Result<()>) -> Result<f64> {
 }
 
 fn points(rows: &[Row], column: usize, of: impl Fn(&Row) -> &[f64]) -> Vec<[f64; 2]> {
-    rows.iter().map(|r| [r.triangles, of(r)[column]]).collect()
+    rows.iter().map(|r| [r.x, of(r)[column]]).collect()
 }
 
 fn table(title: &str, names: &[&str], rows: &[Row], of: impl Fn(&Row) -> &[f64]) {

@@ -180,7 +180,8 @@ fn plot_name(phase: &Phase, axis: &Horizontal) -> String {
 fn plot(phase: &Phase, axis: &Horizontal) -> String {
     let points = |c: &Curve| c.points.iter().map(|p| [(axis.value)(p), p.error]).collect();
     let series = phase.curves.iter().map(|c| Series { name: c.name, points: points(c) }).collect();
-    Plot { title: &phase.title, x_label: axis.label, y_label: "relative error of visible texels", series }.svg()
+    let y_label = "relative error of visible texels";
+    Plot { title: &phase.title, x_label: axis.label, y_label, series, marks: Vec::new() }.svg()
 }
 
 fn errors_csv(phases: &[Phase]) -> String {

@@ -364,6 +364,7 @@ fn plot(rows: &[Row]) -> String {
         x_label: "seconds for all texels",
         y_label: "relative root mean square error of indirect light",
         series,
+        marks: Vec::new(),
     }
     .svg()
 }

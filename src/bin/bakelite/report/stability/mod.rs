@@ -83,7 +83,7 @@ fn plot(rows: &[Row]) -> String {
         points: rows.iter().filter(|r| r.case == case && r.error > 0.0).map(|r| [r.x, r.error]).collect(),
     });
     let series = series.filter(|s| !s.points.is_empty()).collect();
-    Plot { title: "Stability", x_label: "parameter", y_label: "relative error", series }.svg()
+    Plot { title: "Stability", x_label: "parameter", y_label: "relative error", series, marks: Vec::new() }.svg()
 }
 
 fn markdown(rows: &[Row], seconds: &[(&str, f64)], total: f64) -> String {
