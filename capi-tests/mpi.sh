@@ -77,6 +77,8 @@ wait_for_file "$out/lost/radiance-2-of-3.bkshare"
 kill -9 "$victim"
 wait $running || true
 must_be_whole lost
+# While they waited for the rank that was lost, its part was missing.
+grep -q '^texels: [1-9][0-9]* % of all ranks' "$out/lost.txt" || { echo 'no progress was printed'; cat "$out/lost.txt"; exit 1; }
 
 # A bake is cancelled: all ranks end soon, no page is written, and the next one goes on.
 mkdir "$out/cancelled"
@@ -86,7 +88,6 @@ wait_for_file "$out/cancelled/photons-1-of-3.bkshare"
 touch "$out/cancelled/cancel"
 wait $running || true
 grep -q 'cancelled; what is in the folder is kept' "$out/cancelled.txt" || { cat "$out/cancelled.txt"; exit 1; }
-grep -q ' % of all ranks' "$out/cancelled.txt" || { echo 'no progress was printed'; cat "$out/cancelled.txt"; exit 1; }
 [ ! -e "$out/cancelled/page0-combined.exr" ] || { echo 'a cancelled bake wrote pages'; exit 1; }
 rm "$out/cancelled/cancel"
 ranks cancelled 3 60

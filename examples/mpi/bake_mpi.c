@@ -307,6 +307,7 @@ int main(int argc, char **argv)
         wait_for(0, LAID_OUT);
         scene = open_scene(device, scene_name);
         check(bk_lightmap_load_layout(scene, &layout, name, progress, NULL, &map), "layout");
+        tell(STATE, LAID_OUT);
     }
 
     do_stage(PHOTONS, map, argv[1]);
