@@ -92,6 +92,7 @@ impl Scene {
         // The build changes nothing but where arrays of `data` lie, and a panic drops everything that the build has made.
         let build = AssertUnwindSafe(|| {
             device.run(progress, || {
+                data.check_own_triangles()?;
                 if device.has_scratch() {
                     let _held = device.memory().reserve(data.bytes_in_memory(), "the scene")?;
                     device.install(|| data.move_to(device.storage(), progress))?;
@@ -134,7 +135,6 @@ impl Scene {
         if total == 0 {
             return Err(Error::InvalidState("the scene has no triangles".into()));
         }
-        data.check_own_triangles()?;
         let stage = progress.stage("bvh", 0.0, 1.0, 1);
         let first_triangle = data.first_triangles()?;
         let own = data.own_triangles;

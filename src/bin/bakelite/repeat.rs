@@ -1,6 +1,6 @@
 //! A scene beside itself many times, as in the thesis's tables 4.1 to 4.3, which measure scenes and multiples of them.
 
-use bakelite::scene::Instance;
+use bakelite::scene::{Instance, MAX_TRIANGLES};
 use bakelite::{Error, Result, SceneData};
 use glam::{Affine3A, Vec3};
 
@@ -9,6 +9,12 @@ use glam::{Affine3A, Vec3};
 pub fn repeat(data: &mut SceneData, times: u32, as_instances: bool) -> Result<()> {
     if !data.instances().is_empty() {
         return Err(Error::InvalidArgument("--repeat: the scene has instances already".into()));
+    }
+    let triangles = data.triangle_count() as u64 * u64::from(times);
+    // Before copies fill the memory: they would be refused by the commit.
+    if !as_instances && triangles > MAX_TRIANGLES as u64 {
+        let why = format!("--repeat: {triangles} triangles of copies, more than {MAX_TRIANGLES}; try --instances");
+        return Err(Error::InvalidArgument(why));
     }
     let points = || data.meshes().iter().flat_map(|mesh| mesh.positions.iter().copied());
     let (lower, upper) = (points().fold(Vec3::INFINITY, Vec3::min), points().fold(Vec3::NEG_INFINITY, Vec3::max));
@@ -49,5 +55,8 @@ mod tests {
         assert!(copies == instances);
         let mut placed = builtin("colonnade:100000").unwrap();
         assert!(repeat(&mut placed, 2, false).is_err());
+        let most = (MAX_TRIANGLES / once.triangle_count()) as u32;
+        let e = repeat(&mut builtin("cornell").unwrap(), most + 1, false).unwrap_err();
+        assert!(e.to_string().contains("try --instances"), "{e}");
     }
 }

@@ -8,7 +8,7 @@ use crate::base::sampling::uniform;
 use crate::scene::camera::Camera;
 use crate::scene::light::Light;
 use crate::scene::material::Material;
-use crate::scene::{Instance, MAX_PLACED_TRIANGLES, NONE, SceneData};
+use crate::scene::{Instance, MAX_PLACED_TRIANGLES, MAX_TRIANGLES, NONE, SceneData};
 use glam::{Affine3A, Quat, Vec3};
 use std::f32::consts::TAU;
 
@@ -25,10 +25,10 @@ const STEP: f32 = 4.0;
 /// Makes a grove of columns of about `triangles` triangles. `copies`: each is a mesh, instead of an instance of mesh 1;
 /// mesh 0 is the ground.
 pub(super) fn colonnade(triangles: usize, copies: bool) -> Result<SceneData> {
-    if !(MIN_TRIANGLES..=MAX_PLACED_TRIANGLES).contains(&triangles) {
-        return invalid_argument!(
-            "a colonnade of {triangles} triangles, not of {MIN_TRIANGLES} to {MAX_PLACED_TRIANGLES}"
-        );
+    // Copies have one tree.
+    let most = if copies { MAX_TRIANGLES } else { MAX_PLACED_TRIANGLES };
+    if !(MIN_TRIANGLES..=most).contains(&triangles) {
+        return invalid_argument!("a colonnade of {triangles} triangles, not of {MIN_TRIANGLES} to {most}");
     }
     let side = ((triangles / COLUMN).max(LEAST_COLUMNS) as f64).sqrt().round() as u32;
     let mut scene = SceneData::new();
